@@ -1,0 +1,43 @@
+# make demo   fit a transfer function on a generated mesh; pictures and a report in output/demo
+# make test   lint, then all tests (sets up everything it needs)
+# make lint   ruff and pyright only
+# make venv   the environment with all development tools, in .venv
+# make clean  remove the environment, caches and outputs
+#
+# PYTHON picks the interpreter (3.11 or newer):  make test PYTHON=python3.12
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+
+.DELETE_ON_ERROR:
+.PHONY: demo test lint venv clean
+
+demo: $(VENV)/.package
+	$(BIN)/python -m experiments.demo --out output/demo
+
+test: lint
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.tools
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+venv: $(VENV)/.tools
+
+# Each stamp is older than pyproject.toml when that has changed, and the installation is then redone.
+$(VENV)/.package: pyproject.toml
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "jaxvr needs Python 3.11 or newer, but %s is %d.%d: pass PYTHON=..." % (sys.executable, *v[:2]))'
+	@echo "Setting up $(VENV) ..."
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) install --editable .
+	@touch $@
+
+$(VENV)/.tools: $(VENV)/.package
+	$(PIP) install --editable '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) output dist .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

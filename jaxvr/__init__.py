@@ -1,0 +1,26 @@
+"""Differentiable volume rendering of unstructured meshes.
+
+    volume -+
+            +- trace --> segments -- optics --> (colour, depth) -- composite --> pixel -- fit
+    camera -+                                                      gradients flow back <---+
+
+`render(volume, camera, transfer)` is the whole line. Each place in it has a noun that can be
+swapped: a *tracer* turns rays into segments, an *integrator* segments into colour and optical
+depth, a *compositor* those into a pixel, and an *adjoint* says how gradients get back. Two ideas
+carry the rest. Integers are found, floats are derived: which cell and which face is discrete and
+has no gradient, depths and scalars are arithmetic on local data and have one. And: trace once,
+shade many, since segments do not depend on the transfer function.
+
+Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, `view`, `optics`,
+`trace`, `composite`, `adjoint`, `render`, `fit`, `plot`, `cli`.
+"""
+
+from jaxvr import optics
+from jaxvr._core.status import RenderError, check
+from jaxvr.adjoint import Direct, Forward, Replay
+from jaxvr.composite import Over
+from jaxvr.optics import Analytic, Quadrature, TransferFunction
+from jaxvr.render import render, render_rays, shade, trace
+from jaxvr.trace import RayCast, Segments
+from jaxvr.view.camera import Camera
+from jaxvr.volume.mesh import TetMesh

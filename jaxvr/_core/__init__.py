@@ -1,0 +1,1 @@
+"""What every other room stands on: pytrees, checks of arguments, status bits. No idea of rendering."""

@@ -1,0 +1,73 @@
+"""Checks of what users pass in. Each raises a `ValueError` that says what was found, and where.
+
+Values can be looked at only when they are concrete: under `jit` or `grad` an array is a tracer
+and only its shape and dtype are checked.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Array = jax.Array
+
+
+def is_concrete(*arrays: Any) -> bool:
+    """True if no argument is a tracer, so that values can be examined."""
+    return not any(isinstance(a, jax.core.Tracer) for a in arrays)
+
+
+def default_float() -> np.dtype:
+    """float64 when the user has turned x64 on, else float32."""
+    return np.dtype(jnp.zeros(()).dtype)
+
+
+def float_dtype(dtype: Any) -> np.dtype:
+    """`dtype` as one of the two that jaxvr computes in; float64 only where JAX allows it."""
+    d = np.dtype(dtype)
+    if d == np.float64 and default_float() == np.float64:
+        return d
+    return np.dtype(np.float32) if d.kind == "f" else default_float()
+
+
+def as_floats(name: str, x: Any, *, ndim: int | None = None, dtype: Any = None) -> Any:
+    """`x` as a float array (NumPy stays NumPy, JAX stays JAX), or a ValueError that names it."""
+    if not isinstance(x, jax.Array):
+        try:
+            x = np.asarray(x)
+        except Exception as e:
+            raise ValueError(f"{name} cannot be read as an array: {e}") from e
+        if x.dtype.kind not in "fiub":
+            raise ValueError(f"{name} must hold numbers, but has dtype {x.dtype}.")
+    elif jnp.issubdtype(x.dtype, jnp.complexfloating):
+        raise ValueError(f"{name} must be real, but has dtype {x.dtype}.")
+    if ndim is not None and x.ndim != ndim:
+        raise ValueError(f"{name} must have {ndim} dimension(s), but has shape {x.shape}.")
+    return x.astype(float_dtype(x.dtype) if dtype is None else dtype)
+
+
+def require_finite(name: str, x: Any) -> None:
+    """ValueError with the count and the first index of NaN or infinite entries (if concrete)."""
+    if not is_concrete(x):
+        return
+    bad = ~np.isfinite(np.asarray(x))
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        where = first[0] if len(first) == 1 else first
+        raise ValueError(
+            f"{name} has {int(bad.sum())} NaN or infinite entries, the first at index {where}. "
+            "Remove or replace them."
+        )
+
+
+def require_shape(name: str, x: Any, shape: tuple[int | None, ...]) -> None:
+    """ValueError unless `x` has this shape (`None` matches any length)."""
+    ok = x.ndim == len(shape) and all(
+        s is None or s == n for s, n in zip(shape, x.shape, strict=True)
+    )
+    if not ok:
+        want = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
+        raise ValueError(f"{name} must have shape {want}, but has {x.shape}.")

@@ -1,0 +1,47 @@
+"""What goes wrong inside a compiled loop is data: bits in the result, read outside.
+
+`render` and `trace` read them after every call that is not itself being traced. Inside your own
+`jit`, call `jaxvr.check(status)` on the concrete status that `render_rays(..., status=True)`
+returns.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+LOST = 1
+STEPS = 2
+
+_MEANING = {
+    LOST: (
+        "found no way out of a cell",
+        "Its coordinates are NaN or infinite, or the ray is: check `points`, the camera and what "
+        "you changed since the mesh was made.",
+    ),
+    STEPS: (
+        "reached the maximum number of steps",
+        "Increase `max_steps` of the adjoint.",
+    ),
+}
+
+
+class RenderError(RuntimeError):
+    """A ray could not be followed to its end."""
+
+
+def check(status: Any) -> None:
+    """Raise `RenderError` if any ray has a status bit set.
+
+    Args:
+      status: integer bits of any shape, one for each ray; 0 is success.
+    """
+    bits = np.asarray(status)
+    if not bits.any():
+        return
+    for bit, (what, advice) in _MEANING.items():
+        hit = (bits & bit) != 0
+        if hit.any():
+            first = tuple(int(i) for i in np.argwhere(hit)[0])
+            raise RenderError(f"{int(hit.sum())} ray(s) {what}, the first at index {first}. {advice}")

@@ -1,0 +1,21 @@
+"""Adjoints: how gradients get back through the loop along a ray.
+
+An adjoint is an object that supplies the loop (`AbstractAdjoint.run`); everything else is the same
+for all of them, in `march`. This is the only room with `custom_vjp`, which would block forward
+mode elsewhere.
+
+| adjoint | modes | memory | when |
+|---|---|---|---|
+| `Replay` (default) | reverse | that of the result | fits of anything |
+| `Forward` | forward | that of the result | few parameters, `jvp`, `jacfwd` |
+| `Direct` | forward, reverse | grows with cells per ray | small problems, as a check |
+
+A new adjoint is one file with one class, listed here and in the tests' registry.
+"""
+
+from jaxvr.adjoint.base import AbstractAdjoint, Pipeline
+from jaxvr.adjoint.direct import Direct
+from jaxvr.adjoint.forward import Forward
+from jaxvr.adjoint.replay import Replay
+
+__all__ = ["AbstractAdjoint", "Direct", "Forward", "Pipeline", "Replay"]

@@ -1,0 +1,118 @@
+"""What an adjoint is, and the march along rays that all of them share.
+
+One iteration takes the piece at each ray's cursor, composites it, and moves the rays whose segment
+is finished to their next. Rays in a batch go in lock step; a batch ends with its last ray.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxvr.composite.over import Over
+from jaxvr.optics.integrator import AbstractIntegrator
+from jaxvr.optics.partition import Cursor
+from jaxvr.trace.base import AbstractTracer
+
+Array = jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Pipeline:
+    """What renders: nouns without arrays, so that it is a static argument."""
+
+    tracer: AbstractTracer
+    integrator: AbstractIntegrator
+    compositor: Over
+
+
+class Operands(NamedTuple):
+    """What it renders: pytrees of arrays. Leaves of `rays` have the shape (batches, R)."""
+
+    scene: Any
+    rays: Any
+    table: Any
+
+
+class March(NamedTuple):
+    """The state of a batch of R rays."""
+
+    trace: Any
+    cursor: Cursor
+    pixel: Any
+
+
+class AbstractAdjoint(abc.ABC):
+    """Supplies the loop along the rays, and thereby how it is differentiated."""
+
+    @abc.abstractmethod
+    def run(self, pipeline: Pipeline, operands: Operands) -> tuple[Array, Array]:
+        """Premultiplied RGBA (batches, 4, R) and status (batches, R)."""
+
+
+def begin(pipeline: Pipeline, operands: Operands) -> March:
+    """All rays before their first segment. Here and below, `operands.rays` is one batch (R,)."""
+    trace = pipeline.tracer.start(operands.scene, operands.rays)
+    front = trace.segment.front
+    cursor = pipeline.integrator.start(operands.table, front)
+    return March(trace, cursor, pipeline.compositor.start(front.shape[0], front.dtype))
+
+
+def busy(march: March) -> Array:
+    return jnp.any(march.trace.active | march.trace.waiting)
+
+
+def shade_piece(pipeline: Pipeline, operands: Operands, march: March):
+    """Composites the current pieces: the pixel behind them, the cursor, what is finished."""
+    with jax.named_scope("shade"):
+        rgb, depth, cursor, finished = pipeline.integrator.step(
+            operands.table, march.trace.segment, march.cursor
+        )
+        live = march.trace.active
+        pixel = pipeline.compositor.add(
+            march.pixel, jnp.where(live[None], rgb, 0), jnp.where(live, depth, 0)
+        )
+    return pixel, cursor, finished
+
+
+def advance(
+    pipeline: Pipeline, operands: Operands, march: March, cursor: Cursor, finished: Array
+) -> tuple[Any, Cursor]:
+    """The next segments of finished and waiting rays, with cursors at their starts."""
+    idle = ~march.trace.active
+    trace = pipeline.tracer.step(operands.scene, operands.rays, march.trace, finished)
+    front = lax.stop_gradient(trace.segment.front)
+    cursor = Cursor(jnp.where(finished | idle, front, cursor.scalar), cursor.slab)
+
+    def found(cursor: Cursor) -> Cursor:
+        anew = pipeline.integrator.start(operands.table, front)
+        return jax.tree.map(lambda a, b: jnp.where(trace.fresh, a, b), anew, cursor)
+
+    return trace, lax.cond(jnp.any(trace.fresh), found, lambda c: c, cursor)
+
+
+def iterate(pipeline: Pipeline, operands: Operands, march: March) -> March:
+    pixel, cursor, finished = shade_piece(pipeline, operands, march)
+    trace, cursor = advance(pipeline, operands, march, cursor, finished)
+    return March(trace, cursor, pixel)
+
+
+def march_while(pipeline: Pipeline, operands: Operands) -> March:
+    """One batch, by a while loop: as many iterations as its longest ray needs."""
+    return lax.while_loop(
+        busy, lambda m: iterate(pipeline, operands, m), begin(pipeline, operands)
+    )
+
+
+def finish(pipeline: Pipeline, march: March) -> tuple[Array, Array]:
+    return pipeline.compositor.finish(march.pixel), march.trace.status
+
+
+def run_batches(one: Any, operands: Operands) -> tuple[Array, Array]:
+    """`one(operands with one batch of rays)` for each batch, one after the other."""
+    return lax.map(lambda rays: one(operands._replace(rays=rays)), operands.rays)

@@ -1,0 +1,152 @@
+"""What an integrator is: it turns segments into colour and optical depth, piece by piece.
+
+An integrator is a frozen dataclass without arrays, so that it can be a static argument of jit.
+Tables that depend on the transfer function are made by `prepare` and travel as a pytree. To add an
+integrator of slabs, derive from `AbstractSlabIntegrator` and write `slab_integral`; one that
+treats whole segments at once (a pre-integrated table) derives from `AbstractIntegrator`.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxvr._core.stage import stage
+from jaxvr.optics.partition import (
+    Cursor,
+    Ends,
+    Nodes,
+    Segment,
+    cut,
+    ends,
+    gather,
+    locate,
+    nodes_of,
+)
+from jaxvr.optics.transfer import TransferFunction
+
+Array = jax.Array
+
+
+class AbstractIntegrator(abc.ABC):
+    """Colour and optical depth of segments under a transfer function."""
+
+    @abc.abstractmethod
+    def slab(
+        self,
+        extinction_front: Any,
+        extinction_back: Any,
+        color_front: Any,
+        color_back: Any,
+        length: Any,
+    ) -> tuple[Array, Array]:
+        """rgb (..., 3), premultiplied, and alpha (...) of slabs with linear extinction and colour.
+
+        Args:
+          extinction_front, extinction_back (...): per unit of length, >= 0.
+          color_front, color_back (..., 3): linear RGB. length (...): world length, >= 0.
+        """
+
+    @abc.abstractmethod
+    def prepare(self, transfer: TransferFunction, dtype: Any) -> Any:
+        """The table that `step` looks up, differentiable with respect to `transfer`."""
+
+    @abc.abstractmethod
+    def start(self, table: Any, scalar: Array) -> Cursor:
+        """A cursor at the start of segments whose front scalar is `scalar` (R,)."""
+
+    @abc.abstractmethod
+    def step(
+        self, table: Any, segment: Segment, cursor: Cursor
+    ) -> tuple[Array, Array, Cursor, Array]:
+        """Next piece: rgb (3, R), optical depth (R,), cursor behind it, segment finished (R,)."""
+
+    @abc.abstractmethod
+    def gradient_start(self, table: Any) -> Any:
+        """Zeros to accumulate a gradient of the table in."""
+
+    @abc.abstractmethod
+    def pull_back(
+        self,
+        table: Any,
+        segment: Segment,
+        cursor: Cursor,
+        cotangent: tuple[Array, Array],
+        gradient: Any,
+    ) -> tuple[Segment, Any]:
+        """Cotangents of the segment at `cursor`, and `gradient` with the table's share added.
+
+        Args:
+          cotangent: of the piece's rgb (3, R) and optical depth (R,).
+          gradient: as from `gradient_start`, or None if the table's gradient is not wanted.
+        """
+
+    @abc.abstractmethod
+    def gradient_finish(self, table: Any, gradient: Any) -> Any:
+        """The accumulated gradient, in the form of `table`."""
+
+
+class AbstractSlabIntegrator(AbstractIntegrator):
+    """Cuts segments at control points, so that only the integral of one slab is left to write."""
+
+    @abc.abstractmethod
+    def slab_integral(self, piece: Ends) -> tuple[Array, Array]:
+        """rgb (3, R), premultiplied, and optical depth (R,) of slabs; differentiable."""
+
+    def slab(self, extinction_front, extinction_back, color_front, color_back, length):
+        tau_f, tau_b = jnp.asarray(extinction_front), jnp.asarray(extinction_back)
+        c_f, c_b, l = jnp.asarray(color_front), jnp.asarray(color_back), jnp.asarray(length)
+        shape = jnp.broadcast_shapes(
+            tau_f.shape, tau_b.shape, c_f.shape[:-1], c_b.shape[:-1], l.shape
+        )
+        dtype = jnp.result_type(tau_f, tau_b, c_f, c_b, l, jnp.float32)
+
+        def column(tau, color):
+            tau = jnp.broadcast_to(tau, shape).reshape(1, -1)
+            color = jnp.broadcast_to(color, (*shape, 3)).reshape(-1, 3).T
+            return jnp.concatenate([tau, color]).astype(dtype)
+
+        l = jnp.broadcast_to(l, shape).reshape(-1).astype(dtype)
+        rgb, depth = self.slab_integral(Ends(column(tau_f, c_f), column(tau_b, c_b), l))
+        return rgb.T.reshape(*shape, 3), -jnp.expm1(-depth).reshape(shape)
+
+    def prepare(self, transfer, dtype):
+        return nodes_of(transfer, dtype)
+
+    def start(self, table, scalar):
+        return Cursor(jax.lax.stop_gradient(scalar), locate(table, scalar))
+
+    def step(self, table, segment, cursor):
+        wanted = jnp.any(segment.length > 0)
+        piece, cursor, finished = stage(jnp.any(segment.length >= 0), cut, table, segment, cursor)
+        slabs = stage(wanted, gather, table, piece)
+        rgb, depth = stage(wanted, lambda *x: self.slab_integral(ends(*x)), piece, segment, slabs)
+        return rgb, depth, cursor, finished
+
+    def gradient_start(self, table):
+        # Row left + right holds both control points of a slab, (position, optical) twice: even
+        # rows are the outermost slabs, whose control points coincide, row 2 k + 1 is slab k, k + 1.
+        return jnp.zeros((2 * table.position.shape[0], 10), table.position.dtype)
+
+    def pull_back(self, table, segment, cursor, cotangent, gradient):
+        piece, _, _ = cut(table, segment, cursor)
+        slabs = gather(table, piece)
+        _, pull = jax.vjp(lambda s, t: self.slab_integral(ends(piece, s, t)), segment, slabs)
+        segment_bar, slabs_bar = pull(cotangent)
+        if gradient is not None:
+            rows = jnp.concatenate([slabs_bar.position[:, None], slabs_bar.optical], 1)
+            rows = rows.reshape(10, -1).T
+            gradient = gradient.at[piece.left + piece.right].add(rows)
+        return segment_bar, gradient
+
+    def gradient_finish(self, table, gradient):
+        count = table.position.shape[0]
+        rows = jnp.arange(2 * count)
+        left, right = rows // 2, jnp.minimum((rows + 1) // 2, count - 1)
+        nodes = jnp.zeros((count, 5), gradient.dtype)
+        nodes = nodes.at[left].add(gradient[:, :5]).at[right].add(gradient[:, 5:])
+        return Nodes(nodes[:, 0], nodes[:, 1:].T)
+

@@ -1,0 +1,192 @@
+"""A segment, cut at every control point that its scalar crosses.
+
+Between two control points the transfer function is linear, so that a piece of a segment has a
+closed integral. The K control points x_0 <= ... <= x_{K-1} make K + 1 slabs: slab k spans
+[x_{k-1}, x_k], and the first and last reach to infinity with constant values. One loop iteration
+handles one piece, as in Espinha and Celes 2005, Figure 6: a `Cursor` remembers where in its
+segment each ray stands, and moves to the neighbouring slab when the piece ends there.
+
+Two control points at one position are a slab of no width, a jump. A ray that crosses it gets a
+piece of no length there, which contributes nothing but the derivative with respect to where the
+jump is.
+
+Derivatives hold the partition fixed: the integrand is continuous across the ends of a piece, so
+the terms from moving ends cancel between neighbours (Leibniz), and no division by the difference
+of the end scalars is left. First derivatives of whole segments are exact, second ones are not.
+At kinks (a scalar that stays exactly at a control point) the derivative is the one through the
+slab that the value was taken from. Where a segment starts or ends exactly at a jump, the jump's
+own derivative is counted only if the segment goes through.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxvr._core.pytree import pytree
+from jaxvr.optics.transfer import TransferFunction
+
+Array = jax.Array
+_hold = lax.stop_gradient
+
+# The width given to a jump, so that slope times width is its height. Anything far below the
+# rounding of a scalar does; its square must not underflow in float32.
+JUMP_WIDTH = 1e-20
+
+
+class Segment(NamedTuple):
+    """Straight pieces of rays inside one cell, where the scalar is linear.
+
+    front, back (R,): scalar at the two ends, nearer the eye first. length (R,): world length.
+    """
+
+    front: Array
+    back: Array
+    length: Array
+
+
+class Cursor(NamedTuple):
+    """scalar (R,): where the next piece of each segment starts; slab (R,) int32: in which slab."""
+
+    scalar: Array
+    slab: Array
+
+
+@pytree
+class Nodes:
+    """A transfer function with channels first: position (K,), optical (4, K).
+
+    Rows of `optical` are extinction, red, green, blue.
+    """
+
+    position: Array
+    optical: Array
+
+
+class Piece(NamedTuple):
+    """A piece of a segment in one slab: what is held fixed when it is differentiated.
+
+    left, right (R,) int32: the slab's control points; the same one in the two outermost slabs.
+    t (2, R): where the piece starts and ends, as fractions of the segment.
+    place (2, R): the same ends as fractions of the slab, 0 at `left`.
+    fraction (R,): its share of the segment's length. width (R,): of the slab.
+    """
+
+    left: Array
+    right: Array
+    t: Array
+    place: Array
+    fraction: Array
+    width: Array
+
+
+def nodes_of(transfer: TransferFunction, dtype: Any) -> Nodes:
+    rows = jnp.concatenate([transfer.extinctions[None], transfer.colors.T])
+    return Nodes(transfer.positions.astype(dtype), rows.astype(dtype))
+
+
+def locate(nodes: Nodes, scalar: Array) -> Array:
+    """Number of control points at or below each scalar: its slab (the upper one at a border)."""
+    method = "compare_all" if nodes.position.shape[0] <= 32 else "scan_unrolled"
+    found = jnp.searchsorted(_hold(nodes.position), _hold(scalar), side="right", method=method)
+    return found.astype(jnp.int32)
+
+
+def cut(nodes: Nodes, segment: Segment, cursor: Cursor) -> tuple[Piece, Cursor, Array]:
+    """The piece at the cursor, the cursor behind it, and whether that was the segment's last.
+
+    A cursor that is in the wrong slab moves by one and its piece is empty, so any cursor gets
+    right by itself.
+    """
+    count = nodes.position.shape[0]
+    front, back, (scalar, slab) = _hold(segment.front), _hold(segment.back), cursor
+    left, right = jnp.maximum(slab - 1, 0), jnp.minimum(slab, count - 1)
+    low, high = _hold(nodes.position)[left], _hold(nodes.position)[right]
+    outermost = (slab == 0) | (slab == count)
+    floor = jnp.where(slab == 0, -jnp.inf, low)
+    ceiling = jnp.where(slab == count, jnp.inf, high)
+
+    change = back - front
+    up, flat = change > 0, change == 0
+    # A constant scalar at a border belongs to the upper slab: tf(s) takes the upper side's value.
+    above = (scalar > ceiling) | (flat & (scalar == ceiling))
+    below = scalar < floor
+    astray = above | below
+    end = jnp.where(up, jnp.minimum(back, ceiling), jnp.maximum(back, floor))
+    onward = (jnp.where(up, back > ceiling, back < floor) & ~flat) | astray
+    upward = jnp.where(astray, above, up)
+
+    per_scalar = 1 / jnp.where(flat, 1, change)
+    jump = (high - low < JUMP_WIDTH) & ~outermost
+    fraction = jnp.where(flat, 1.0, (end - scalar) * per_scalar)
+    fraction = jnp.where(jump, JUMP_WIDTH * jnp.abs(per_scalar), fraction)
+    fraction = jnp.where(astray, 0.0, fraction)
+    width = jnp.where(jump | outermost, JUMP_WIDTH, high - low)
+    slope = jnp.where(outermost | astray, 0.0, 1 / width)
+
+    def place(at: Array, in_jump: Array) -> Array:
+        return jnp.where(jump, in_jump.astype(at.dtype), (at - low) * slope)
+
+    piece = Piece(
+        left,
+        right,
+        jnp.stack([(scalar - front) * per_scalar, jnp.where(flat, 1, (end - front) * per_scalar)]),
+        jnp.stack([place(scalar, ~up), place(end, up)]),
+        fraction,
+        width,
+    )
+    moved = jnp.where(onward, jnp.where(upward, 1, -1), 0)
+    cursor = Cursor(jnp.where(astray, scalar, end), slab + moved.astype(jnp.int32))
+    return piece, cursor, ~onward
+
+
+class Slabs(NamedTuple):
+    """The two control points of each piece's slab: position (2, R), optical (2, 4, R)."""
+
+    position: Array
+    optical: Array
+
+
+def gather(nodes: Nodes, piece: Piece) -> Slabs:
+    both = (piece.left, piece.right)
+    return Slabs(
+        jnp.stack([nodes.position[k] for k in both]),
+        jnp.stack([nodes.optical[:, k] for k in both]),
+    )
+
+
+class Ends(NamedTuple):
+    """A piece ready for a slab integral: optical (4, R) at its two ends and its length (R,)."""
+
+    front: Array
+    back: Array
+    length: Array
+
+
+@jax.custom_jvp
+def _place(place, t, width, front, back, position):
+    return place
+
+
+@_place.defjvp
+def _place_jvp(primals, tangents):
+    # place = (s(t) - x_left) / (x_right - x_left) at fixed t: it changes by
+    # [(1 - t) ds_front + t ds_back - (1 - place) dx_left - place dx_right] / width.
+    place, t, width, _, _, _ = primals
+    _, _, _, d_front, d_back, d_position = tangents
+    moved = (1 - t) * d_front[None] + t * d_back[None]
+    moved = moved - (1 - place) * d_position[:1] - place * d_position[1:]
+    return place, moved / width[None]
+
+
+def ends(piece: Piece, segment: Segment, slabs: Slabs) -> Ends:
+    """Extinction and colour at the ends of a piece, differentiable with the partition fixed."""
+    place = _place(
+        *(piece.place, piece.t, piece.width, segment.front, segment.back, slabs.position)
+    )
+    left, right = slabs.optical
+    front, back = (left + p[None] * (right - left) for p in place)
+    return Ends(front, back, segment.length * piece.fraction)

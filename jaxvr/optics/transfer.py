@@ -1,0 +1,370 @@
+"""`TransferFunction`: colour and extinction as piecewise linear functions of the scalar.
+
+Between its control points a transfer function is linear, outside them constant. Two control points
+at one position are a jump: below it the first counts, at it and above it the second. Emission
+follows the density emitter of Williams and Max ("A volume density optical model", 1992): along a
+ray dI = extinction(s) * color(s) * exp(-optical depth) dl, with extinction per unit of length.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvr._core.checks import (
+    as_floats,
+    default_float,
+    float_dtype,
+    is_concrete,
+    require_finite,
+    require_shape,
+)
+from jaxvr.optics import colormaps
+
+Array = jax.Array
+
+
+@jax.tree_util.register_pytree_with_keys_class
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class TransferFunction:
+    """A piecewise linear map from scalars to colours and extinctions, with K control points.
+
+    positions (K,):   scalar values, never decreasing; two equal ones are a jump, three an error.
+    colors (K, 3):    linear RGB; any finite number (above 1 for lights brighter than white).
+    extinctions (K,): per unit of length, >= 0, any size.
+
+    The three share one dtype: that of the arrays passed, JAX's default float for plain numbers, or
+    `dtype`. Calling the class checks everything; under `jit` and `grad`, where values are not
+    known, it checks the shapes. Rebuilding from leaves (`jax.tree`) checks nothing, so gradients
+    and other trees of the same structure are TransferFunctions too.
+    """
+
+    positions: Array
+    colors: Array
+    extinctions: Array
+
+    def __init__(self, positions: Any, colors: Any, extinctions: Any, *, dtype: Any = None):
+        dtype = _dtype(dtype, positions, colors, extinctions)
+        positions = as_floats("positions", positions, ndim=1, dtype=dtype)
+        colors = as_floats("colors", colors, ndim=2, dtype=dtype)
+        extinctions = as_floats("extinctions", extinctions, ndim=1, dtype=dtype)
+        k = positions.shape[0]
+        if k == 0:
+            raise ValueError("A transfer function needs at least one control point, but has none.")
+        require_shape("colors", colors, (k, 3))
+        require_shape("extinctions", extinctions, (k,))
+        require_finite("positions", positions)
+        require_finite("colors", colors)
+        require_finite("extinctions", extinctions)
+        _require_sorted(positions)
+        _require_nonnegative(extinctions)
+        _set(self, jnp.asarray(positions), jnp.asarray(colors), jnp.asarray(extinctions))
+
+    # JAX's register_dataclass would run `__init__`, and its checks, at every unflatten.
+    def tree_flatten_with_keys(self) -> tuple[tuple[tuple[Any, Any], ...], None]:
+        names = ("positions", "colors", "extinctions")
+        return tuple((jax.tree_util.GetAttrKey(n), getattr(self, n)) for n in names), None
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
+        return (self.positions, self.colors, self.extinctions), None
+
+    @classmethod
+    def tree_unflatten(cls, aux: None, leaves: Any) -> TransferFunction:
+        self = object.__new__(cls)
+        _set(self, *leaves)
+        return self
+
+    @staticmethod
+    def from_colormap(
+        colormap: Any,
+        positions: Any,
+        extinctions: Any,
+        srgb: bool = False,
+        *,
+        points: int | None = None,
+        dtype: Any = None,
+    ) -> TransferFunction:
+        """Control points at `positions` (K,) with colours from a colour map.
+
+        colormap: the name of a matplotlib colour map, a function from numbers in [0, 1] (n,) to
+            colours (n, 3) or (n, 4), or a table (n, 3) or (n, 4) that is interpolated linearly. It
+            spans positions[0] to positions[-1] linearly; alpha is ignored.
+        srgb: colour maps are made for display, and their numbers are taken as linear RGB as they
+            stand, so that a picture saved as it is shows them unchanged. With True they are decoded
+            from sRGB first (then save pictures with `srgb=True`).
+        points: add control points, so that the map is followed at this many evenly spaced positions
+            beside the given ones (between control points colours are interpolated linearly).
+
+        Raises ValueError for an unknown name, a malformed table, or positions that are traced.
+        """
+        if not is_concrete(positions):
+            raise ValueError("from_colormap needs known positions; call it outside jit and grad.")
+        dtype = _dtype(dtype, positions, extinctions)
+        positions = np.asarray(as_floats("positions", positions, ndim=1, dtype=np.float64))
+        require_finite("positions", positions)
+        _require_sorted(positions)
+        colors = colormaps.sample(colormap, _span(positions), srgb=srgb)
+        tf = TransferFunction(positions.astype(dtype), colors.astype(dtype), extinctions)
+        if points is None:
+            return tf
+        if points < 1:
+            raise ValueError(f"points must be at least 1, but is {points}.")
+        extra = np.linspace(positions[0], positions[-1], points).astype(dtype)
+        extra = extra[~np.isin(extra, positions.astype(dtype))]
+        merged = np.sort(np.concatenate([positions.astype(dtype), extra]))
+        fine = colormaps.sample(colormap, _span(merged.astype(np.float64)), srgb=srgb)
+        return tf.resample(merged).replace(colors=fine.astype(dtype))
+
+    @staticmethod
+    def from_opacity(
+        positions: Any,
+        colors: Any,
+        opacities: Any,
+        unit_distance: Any = 1.0,
+        convention: str = "unstructured",
+        *,
+        max_opacity: float | None = None,
+        dtype: Any = None,
+    ) -> TransferFunction:
+        """From opacities (K,) in [0, 1] that hold for a length of `unit_distance`, as VTK has them.
+
+        VTK (and ParaView) means two things by one opacity o:
+
+            "unstructured": extinction = o / unit_distance           (unstructured grids)
+            "grid":         alpha = 1 - (1 - o)^(length / unit_distance), so that
+                            extinction = -log(1 - o) / unit_distance  (regular grids)
+
+        `colors` (K, 3), or a colour map as in `from_colormap`. In the grid convention an opacity of
+        1 is an infinite extinction and so a ValueError, unless `max_opacity` < 1 is given, to which
+        larger opacities are then lowered.
+        """
+        _require_convention(convention)
+        dtype = _dtype(dtype, positions, colors, opacities)
+        opacities = as_floats("opacities", opacities, ndim=1, dtype=dtype)
+        unit = as_floats("unit_distance", unit_distance, ndim=0, dtype=dtype)
+        require_finite("opacities", opacities)
+        _require_unit(unit)
+        if is_concrete(opacities):
+            o = np.asarray(opacities)
+            if ((o < 0) | (o > 1)).any():
+                k = int(np.argmax((o < 0) | (o > 1)))
+                raise ValueError(f"Opacities lie between 0 and 1, but opacities[{k}] is {o[k]:g}.")
+        if max_opacity is not None:
+            if not 0 <= max_opacity <= 1:
+                raise ValueError(f"max_opacity must lie in [0, 1], but is {max_opacity:g}.")
+            opacities = jnp.minimum(opacities, jnp.asarray(max_opacity, dtype))
+        if convention == "grid":
+            if is_concrete(opacities) and (np.asarray(opacities) == 1).any():
+                k = int(np.argmax(np.asarray(opacities) == 1))
+                raise ValueError(
+                    f"opacities[{k}] is 1, which on a regular grid means an infinite extinction. "
+                    "Lower it, or pass max_opacity (0.999, say) to do so for all."
+                )
+            extinctions = -jnp.log1p(-jnp.asarray(opacities)) / unit
+        else:
+            extinctions = jnp.asarray(opacities) / unit
+        if isinstance(colors, str) or callable(colors):
+            return TransferFunction.from_colormap(colors, positions, extinctions, dtype=dtype)
+        return TransferFunction(positions, colors, extinctions, dtype=dtype)
+
+    def to_opacity(self, unit_distance: Any = 1.0, convention: str = "unstructured") -> Array:
+        """Opacities (K,) for a length of `unit_distance`, the inverse of `from_opacity`.
+
+        In the "unstructured" convention they may exceed 1; choose a smaller unit then.
+        """
+        _require_convention(convention)
+        unit = as_floats("unit_distance", unit_distance, ndim=0, dtype=self.dtype)
+        _require_unit(unit)
+        if convention == "grid":
+            return -jnp.expm1(-self.extinctions * unit)
+        return self.extinctions * unit
+
+    def __call__(self, scalars: Any) -> tuple[Array, Array]:
+        """Colours (..., 3) and extinctions (...) at `scalars` (...).
+
+        At a jump it is the upper side's value. Differentiable in the scalars and in every field:
+        at a control point the derivative is that of the interval above it, outside the control
+        points that in the scalar is zero, and a jump's height has no part in it. NaN gives NaN.
+        """
+        return self._evaluate(scalars, "right")
+
+    def _evaluate(self, scalars: Any, side: str) -> tuple[Array, Array]:
+        s = jnp.asarray(scalars)
+        return _evaluate(self, s.astype(jnp.promote_types(s.dtype, self.dtype)), side)
+
+    def resample(self, positions: Any) -> TransferFunction:
+        """This function at other control points (M,); the same function if they include all of K.
+
+        Where `positions` names a position twice, the two get the values on either side of it, so
+        jumps survive when they are named; else a jump becomes a ramp between its new neighbours.
+        """
+        positions = as_floats("positions", positions, ndim=1, dtype=self.dtype)
+        require_finite("positions", positions)
+        _require_sorted(positions)
+        if positions.shape[0] == 0:
+            raise ValueError("resample needs at least one position, but got none.")
+        positions = jnp.asarray(positions)
+        upper_c, upper_e = self._evaluate(positions, "right")
+        lower_c, lower_e = self._evaluate(positions, "left")
+        first = jnp.concatenate([positions[:-1] == positions[1:], jnp.zeros(1, bool)])
+        colors = jnp.where(first[:, None], lower_c, upper_c)
+        return TransferFunction(positions, colors, jnp.where(first, lower_e, upper_e))
+
+    def with_points(self, n: int) -> TransferFunction:
+        """Resampled at `n` evenly spaced control points from the first position to the last."""
+        if n < 2 or self.positions.shape[0] < 2:
+            raise ValueError(
+                f"with_points needs n >= 2 and a function with at least two control points, "
+                f"but n is {n} and there are {self.positions.shape[0]}."
+            )
+        return self.resample(jnp.linspace(self.positions[0], self.positions[-1], n))
+
+    def scaled(self, extinction_factor: Any) -> TransferFunction:
+        """With all extinctions multiplied by a number >= 0."""
+        factor = as_floats("extinction_factor", extinction_factor, ndim=0, dtype=self.dtype)
+        return self.replace(extinctions=self.extinctions * factor)
+
+    def replace(self, **changes: Any) -> TransferFunction:
+        """With some fields changed, checked like a new one; the dtype stays."""
+        fields = {"positions", "colors", "extinctions"}
+        if unknown := set(changes) - fields:
+            raise ValueError(
+                f"A transfer function has no {sorted(unknown)}, only {sorted(fields)}."
+            )
+        return TransferFunction(
+            changes.get("positions", self.positions),
+            changes.get("colors", self.colors),
+            changes.get("extinctions", self.extinctions),
+            dtype=self.dtype,
+        )
+
+    def astype(self, dtype: Any) -> TransferFunction:
+        """In float32 or float64."""
+        return TransferFunction(self.positions, self.colors, self.extinctions, dtype=dtype)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The dtype of the three fields."""
+        return np.dtype(self.positions.dtype)
+
+    def to_json(self, path: str | os.PathLike[str] | None = None) -> str:
+        """JSON text that gives the same numbers back; also written to `path` if there is one."""
+        from jaxvr.optics import transfer_json
+
+        return transfer_json.write(self, path)
+
+    @staticmethod
+    def from_json(
+        source: Any,
+        *,
+        unit_distance: float = 1.0,
+        convention: str = "unstructured",
+        points: int = 256,
+        name: str | None = None,
+        srgb: bool = False,
+        dtype: Any = None,
+    ) -> TransferFunction:
+        """From what `to_json` wrote, or from a colour map exported by ParaView as JSON.
+
+        `source` is a path, JSON text, or what `json.load` returned. The keywords but `dtype` are
+        for ParaView's files: see `jaxvr.optics.transfer_json`.
+        """
+        from jaxvr.optics import transfer_json
+
+        return transfer_json.read(
+            source,
+            unit_distance=unit_distance,
+            convention=convention,
+            points=points,
+            name=name,
+            srgb=srgb,
+            dtype=dtype,
+        )
+
+
+@functools.partial(jax.jit, static_argnames="side")
+def _evaluate(tf: TransferFunction, s: Array, side: str) -> tuple[Array, Array]:
+    k = tf.positions.shape[0]
+    above = jnp.searchsorted(tf.positions, s, side=side)
+    lo, hi = jnp.clip(above - 1, 0, k - 1), jnp.clip(above, 0, k - 1)
+    start, width = tf.positions[lo], tf.positions[hi] - tf.positions[lo]
+    # Outside the control points lo == hi; both operands of the division are guarded, so that
+    # neither an infinite scalar nor the zero width gives a NaN in the unused branch.
+    inside = width > 0
+    step = jnp.where(inside, s, start) - start
+    t = jnp.where(inside, step / jnp.where(inside, width, 1), jnp.where(jnp.isnan(s), s, 0))
+    below_c, below_e = tf.colors[lo], tf.extinctions[lo]
+    colors = below_c + t[..., None] * (tf.colors[hi] - below_c)
+    return colors, below_e + t * (tf.extinctions[hi] - below_e)
+
+
+def _set(tf: TransferFunction, positions: Any, colors: Any, extinctions: Any) -> None:
+    object.__setattr__(tf, "positions", positions)
+    object.__setattr__(tf, "colors", colors)
+    object.__setattr__(tf, "extinctions", extinctions)
+
+
+def _dtype(dtype: Any, *arrays: Any) -> np.dtype:
+    """The dtype asked for, else the widest float among the arrays, else JAX's default."""
+    if dtype is not None:
+        return float_dtype(dtype)
+    floats = [
+        a.dtype for a in arrays if hasattr(a, "dtype") and jnp.issubdtype(a.dtype, jnp.floating)
+    ]
+    return float_dtype(jnp.result_type(*floats)) if floats else default_float()
+
+
+def _span(positions: np.ndarray) -> np.ndarray:
+    """Where each position lies between the first (0) and the last (1)."""
+    if len(positions) == 0:
+        return positions
+    width = positions[-1] - positions[0]
+    return (positions - positions[0]) / width if width > 0 else np.linspace(0, 1, len(positions))
+
+
+def _require_sorted(positions: Any) -> None:
+    if not is_concrete(positions):
+        return
+    p = np.asarray(positions)
+    down = np.flatnonzero(p[1:] < p[:-1])
+    if len(down):
+        k = int(down[0])
+        raise ValueError(
+            f"positions must not decrease, but positions[{k + 1}] = {p[k + 1]:g} comes after "
+            f"positions[{k}] = {p[k]:g}. Sort the control points."
+        )
+    triple = np.flatnonzero(p[2:] == p[:-2])
+    if len(triple):
+        k = int(triple[0])
+        raise ValueError(
+            f"Two equal positions make a jump, but positions[{k}], [{k + 1}] and [{k + 2}] are all "
+            f"{p[k]:g}. Keep the first and the last of them."
+        )
+
+
+def _require_nonnegative(extinctions: Any) -> None:
+    if not is_concrete(extinctions):
+        return
+    e = np.asarray(extinctions)
+    if (e < 0).any():
+        k = int(np.argmax(e < 0))
+        raise ValueError(
+            f"Extinctions must not be negative, but {int((e < 0).sum())} of {len(e)} are, the "
+            f"first extinctions[{k}] = {e[k]:g}."
+        )
+
+
+def _require_convention(convention: str) -> None:
+    if convention not in ("unstructured", "grid"):
+        raise ValueError(f"convention must be 'unstructured' or 'grid', but is {convention!r}.")
+
+
+def _require_unit(unit: Any) -> None:
+    if is_concrete(unit) and not 0 < float(unit) < np.inf:
+        raise ValueError(f"unit_distance must be a length above 0, but is {float(unit):g}.")

@@ -1,0 +1,278 @@
+"""Transfer functions as JSON: jaxvr's own format, and colour maps exported by ParaView.
+
+jaxvr's format holds each number with as many digits as give the same float back:
+
+    {"format": "jaxvr.TransferFunction", "version": 1, "dtype": "float64",
+     "positions": [K], "colors": [[3], K times], "extinctions": [K]}
+
+ParaView exports a list of colour maps, each with "RGBPoints" (x, r, g, b, ...), "ColorSpace" (RGB,
+HSV, Lab, Diverging or Step) and perhaps "Points" (x, opacity, midpoint, sharpness, ...), read here
+as vtkColorTransferFunction and vtkPiecewiseFunction interpret them. All nodes of both become
+control points, so nothing between two colour nodes is lost; where ParaView's curve is not linear in
+RGB and opacity, control points are added between the nodes. "NanColor" is ignored, since scalars
+are finite, and so are "IndexedColors" beside "RGBPoints".
+
+Two departures from VTK 9.7: a sharpness of 1 is piecewise constant, as VTK's documentation has it,
+and not merely steep; and where the hues of a diverging map lie more than half a circle apart, the
+short way is taken.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxvr.optics import colormaps
+
+if TYPE_CHECKING:
+    from jaxvr.optics.transfer import TransferFunction
+
+FORMAT = "jaxvr.TransferFunction"
+
+
+def write(tf: TransferFunction, path: str | os.PathLike[str] | None = None) -> str:
+    """JSON text of a transfer function; also written to `path` if there is one."""
+    document = {
+        "format": FORMAT,
+        "version": 1,
+        "dtype": tf.dtype.name,
+        "positions": np.asarray(tf.positions, np.float64).tolist(),
+        "colors": np.asarray(tf.colors, np.float64).tolist(),
+        "extinctions": np.asarray(tf.extinctions, np.float64).tolist(),
+    }
+    text = json.dumps(document, allow_nan=False) + "\n"
+    if path is not None:
+        Path(path).write_text(text, encoding="utf-8")
+    return text
+
+
+def read(
+    source: Any,
+    *,
+    unit_distance: float = 1.0,
+    convention: str = "unstructured",
+    points: int = 256,
+    name: str | None = None,
+    srgb: bool = False,
+    dtype: Any = None,
+) -> TransferFunction:
+    """A transfer function from a path, JSON text, or what `json.load` returned.
+
+    dtype: defaults to that of the file (float64 only where JAX allows it), for ParaView's files to
+        JAX's default float.
+
+    The rest is for ParaView's files.
+
+    unit_distance, convention: what an opacity means, as in `TransferFunction.from_opacity`.
+        Without "Points" the opacity rises from 0 at the first colour to 1 at the last, as in
+        ParaView.
+    points: about how many control points to add where a curve is not linear, spread evenly over the
+        intervals between nodes that need them.
+    name: which colour map, if there are several.
+    srgb: decode colours from sRGB; else they are taken as they stand.
+
+    Raises ValueError for anything that is not one of the two formats.
+    """
+    document = _load(source)
+    if isinstance(document, dict) and "format" in document:
+        return _own(document, dtype)
+    entry = _choose(document, name)
+    nodes, colors, space = _color_nodes(entry)
+    curve = _opacity_nodes(entry, nodes)
+    positions, colors, opacities = _sample(nodes, colors, space, curve, points, dtype)
+    if srgb:
+        colors = colormaps.srgb_to_linear(colors)
+    make = _transfer_class().from_opacity
+    return make(positions, colors, opacities, unit_distance, convention, dtype=positions.dtype)
+
+
+def _transfer_class() -> type[TransferFunction]:
+    from jaxvr.optics.transfer import TransferFunction  # it imports this module
+
+    return TransferFunction
+
+
+def _load(source: Any) -> Any:
+    if isinstance(source, dict | list):
+        return source
+    if not isinstance(source, str | os.PathLike):
+        raise ValueError(f"A path, JSON text, a dict or a list is needed, not {type(source)}.")
+    where = "The text"
+    if isinstance(source, str) and source.lstrip()[:1] in ("{", "["):
+        text = source
+    else:
+        where = str(source)
+        try:
+            text = Path(source).read_text(encoding="utf-8")
+        except UnicodeDecodeError as e:
+            raise ValueError(f"{where} is not a text file: {e}") from e
+        except (OSError, ValueError) as e:
+            raise ValueError(f"{where!r} is neither JSON text nor a readable file: {e}") from e
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as e:
+        raise ValueError(f"{where} is not valid JSON: {e}") from e
+
+
+def _own(document: dict[str, Any], dtype: Any) -> TransferFunction:
+    if document["format"] != FORMAT or document.get("version") != 1:
+        raise ValueError(
+            f"format is {document['format']!r}, version {document.get('version')!r}, "
+            f"but only {FORMAT!r}, version 1, can be read."
+        )
+    stored = document.get("dtype", "float64")
+    if stored not in ("float32", "float64"):
+        raise ValueError(f"dtype must be 'float32' or 'float64', but is {stored!r}.")
+    arrays = [_numbers(document, key) for key in ("positions", "colors", "extinctions")]
+    return _transfer_class()(*arrays, dtype=stored if dtype is None else dtype)
+
+
+def _numbers(document: dict[str, Any], key: str) -> np.ndarray:
+    if key not in document:
+        raise ValueError(f"{key!r} is missing; there are {sorted(map(str, document))}.")
+    try:
+        array = np.asarray(document[key])
+    except ValueError as e:
+        raise ValueError(f"{key!r} is not a regular array: {e}") from e
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{key!r} must hold numbers only.")
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{key!r} holds NaN or infinite numbers.")
+    return array
+
+
+def _choose(document: Any, name: str | None) -> dict[str, Any]:
+    entries = document if isinstance(document, list) else [document]
+    if not entries or not all(isinstance(e, dict) for e in entries):
+        raise ValueError("This JSON holds no colour maps: a list of objects is needed.")
+    names = [str(e.get("Name", "")) for e in entries]
+    if name is not None:
+        if name not in names:
+            raise ValueError(f"There is no colour map {name!r}, only {names}.")
+        return entries[names.index(name)]
+    if len(entries) > 1:
+        raise ValueError(f"There are {len(entries)} colour maps; choose by name among {names}.")
+    return entries[0]
+
+
+def _color_nodes(entry: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, str]:
+    if "RGBPoints" not in entry:
+        if "IndexedColors" in entry:
+            raise ValueError("This colour map is categorical (IndexedColors): it has no positions.")
+        raise ValueError(f"'RGBPoints' is missing; there are {sorted(map(str, entry))}.")
+    nodes = _quadruples(entry, "RGBPoints")
+    space = entry.get("ColorSpace", "RGB")
+    if space == "HSV" and entry.get("HSVWrap", False):
+        space = "HSVWrap"
+    if not isinstance(space, str) or space not in colormaps.SPACES:
+        known = ", ".join(colormaps.SPACES)
+        raise ValueError(f"ColorSpace {space!r} cannot be read, only {known}.")
+    return nodes[:, 0], nodes[:, 1:], space
+
+
+def _opacity_nodes(entry: dict[str, Any], nodes: np.ndarray) -> np.ndarray:
+    """(n, 4): x, opacity, midpoint, sharpness, as in "Points"."""
+    if entry.get("Points") is None:
+        return np.array([[nodes[0], 0.0, 0.5, 0.0], [nodes[-1], 1.0, 0.5, 0.0]])
+    curve = _quadruples(entry, "Points")
+    if (curve[:, 1] < 0).any() or (curve[:, 1] > 1).any():
+        raise ValueError(f"The opacities of 'Points' must lie in [0, 1], but are {curve[:, 1]}.")
+    curve[:, 2] = np.clip(curve[:, 2], 1e-5, 1 - 1e-5)  # as VTK does
+    curve[:, 3] = np.clip(curve[:, 3], 0, 1)
+    return curve
+
+
+def _quadruples(entry: dict[str, Any], key: str) -> np.ndarray:
+    flat = _numbers(entry, key)
+    if flat.ndim != 1 or flat.size == 0 or flat.size % 4:
+        raise ValueError(f"{key!r} must be a flat list of 4 numbers a node, but has {flat.shape}.")
+    rows = flat.reshape(-1, 4)
+    if (np.diff(rows[:, 0]) < 0).any():
+        raise ValueError(f"The nodes of {key!r} must be sorted by their first number.")
+    return rows
+
+
+def _sample(
+    nodes: np.ndarray, colors: np.ndarray, space: str, curve: np.ndarray, points: int, dtype: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Control points that follow both curves: positions, colours, opacities."""
+    x, _, mid, sharp = curve.T
+    middle = x[:-1] + mid[:-1] * np.diff(x)
+    at = [nodes, x, middle[(mid[:-1] != 0.5) | (sharp[:-1] > 0.99)]]
+    curved = []  # intervals that straight lines would not follow
+    if space not in ("RGB", "Step"):
+        curved += list(zip(nodes[:-1], nodes[1:], strict=True))
+    for k in np.flatnonzero((sharp[:-1] >= 0.01) & (sharp[:-1] <= 0.99)):
+        curved += [(x[k], middle[k]), (middle[k], x[k + 1])]
+    if curved:
+        if points < 1:
+            raise ValueError(f"points must be at least 1, but is {points}.")
+        each = -(-points // len(curved))
+        at += [np.linspace(lo, hi, each + 2) for lo, hi in curved]
+    grid = np.unique(np.concatenate(at))
+    both = [
+        np.column_stack(
+            [_colors_at(nodes, colors, space, grid, side), _opacity_at(curve, grid, side)]
+        )
+        for side in ("left", "right")
+    ]
+    jumps = np.abs(both[0] - both[1]).max(axis=1) > 1e-12
+    values = np.concatenate([both[0][jumps], both[1]])
+    positions = np.concatenate([grid[jumps], grid])
+    order = np.argsort(positions, kind="stable")  # at a jump the lower side comes first
+    positions, values = positions[order].astype(_float(dtype)), values[order]
+    # Rounded to float32, neighbours may have become equal: a run keeps its first and its last.
+    run = np.concatenate([[False], positions[1:] == positions[:-1]])
+    inner = run & np.concatenate([run[1:], [False]])
+    positions, values = positions[~inner], values[~inner]
+    return positions, values[:, :3], np.clip(values[:, 3], 0, 1)  # clips rounding only
+
+
+def _float(dtype: Any) -> np.dtype:
+    from jaxvr._core.checks import default_float, float_dtype
+
+    return default_float() if dtype is None else float_dtype(dtype)
+
+
+def _interval(x: np.ndarray, s: np.ndarray, side: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nodes on both sides of `s`, and the fraction between them, seen from the given side."""
+    above = np.searchsorted(x, s, side=side)
+    lo, hi = np.clip(above - 1, 0, len(x) - 1), np.clip(above, 0, len(x) - 1)
+    width = x[hi] - x[lo]
+    return lo, hi, np.where(width > 0, (s - x[lo]) / np.where(width > 0, width, 1), 0.0)
+
+
+def _colors_at(
+    nodes: np.ndarray, colors: np.ndarray, space: str, s: np.ndarray, side: str
+) -> np.ndarray:
+    lo, hi, t = _interval(nodes, s, side)
+    if space == "Step":
+        return colors[hi]
+    mixed = colormaps.interpolate(space, colors[lo], colors[hi], t)
+    # A conversion to another space and back would round the nodes' own colours.
+    mixed = np.where((t == 1.0)[:, None], colors[hi], mixed)
+    return np.where((t == 0.0)[:, None], colors[lo], mixed)
+
+
+def _opacity_at(curve: np.ndarray, s: np.ndarray, side: str) -> np.ndarray:
+    """vtkPiecewiseFunction between nodes: the midpoint warps t, the sharpness bends the curve."""
+    lo, hi, t = _interval(curve[:, 0], s, side)
+    y1, y2, mid, sharp = curve[lo, 1], curve[hi, 1], curve[lo, 2], curve[lo, 3]
+    at_middle = s == curve[lo, 0] + mid * (curve[hi, 0] - curve[lo, 0])
+    t = np.where(t < mid, 0.5 * t / mid, 0.5 + 0.5 * (t - mid) / (1 - mid))
+    linear = y1 + t * (y2 - y1)
+    upper = (t >= 0.5) & ~at_middle if side == "left" else (t >= 0.5) | at_middle
+    step = np.where(upper, y2, y1)
+    power = 1.0 + 10.0 * sharp
+    bent = np.where(t < 0.5, 0.5 * (2 * t) ** power, 1 - 0.5 * (2 * (1 - t)) ** power)
+    # Hermite with the ends' slopes flattened by the sharpness.
+    b2, b3 = bent**2, bent**3
+    slope = (1 - sharp) * (y2 - y1)
+    hermite = (2 * b3 - 3 * b2 + 1) * y1 + (3 * b2 - 2 * b3) * y2 + (2 * b3 - 3 * b2 + bent) * slope
+    hermite = np.clip(hermite, np.minimum(y1, y2), np.maximum(y1, y2))
+    return np.select([lo == hi, sharp < 0.01, sharp > 0.99], [y1, linear, step], hermite)

@@ -1,0 +1,339 @@
+"""`render`, `render_rays`, `trace` and `shade`: the whole architecture in one call.
+
+    volume, camera -- tracer --> segments -- integrator --> colours -- compositor --> pixels
+
+`render` is `shade(trace(...))` without storing the segments. Rays go in batches of `BATCH`, square
+tiles of the image, so that the rays of a batch stay together. Integers and floats of volume,
+camera and transfer function are arguments of one compiled function: a new camera, transfer
+function or field does not compile again, a new mesh size, image size or number of control points
+does.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvr._core.checks import as_floats, is_concrete, require_finite
+from jaxvr._core.status import check
+from jaxvr.adjoint import AbstractAdjoint, Pipeline, Replay
+from jaxvr.adjoint.base import Operands
+from jaxvr.composite import Over
+from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
+from jaxvr.trace import AbstractTracer, RayCast, Recorded, Segments
+from jaxvr.trace.recorded import fill, record
+from jaxvr.view.camera import Camera
+
+Array = jax.Array
+
+# Rays in one batch: enough to hide the cost of starting a kernel, few enough to stay in cache.
+BATCH = 4096
+
+
+def render(
+    volume: Any,
+    camera: Camera,
+    transfer: TransferFunction,
+    *,
+    tracer: AbstractTracer | None = None,
+    integrator: AbstractIntegrator | None = None,
+    compositor: Over | None = None,
+    adjoint: AbstractAdjoint | None = None,
+    background: Any = None,
+) -> Array:
+    """An image of a volume.
+
+    Args:
+      volume: a `TetMesh`.
+      camera: where from, and how many pixels.
+      transfer: colour and extinction of each scalar.
+      tracer: `RayCast()` if None. integrator: `Analytic()`. compositor: `Over()`.
+      adjoint: `Replay()`, for reverse mode; `Forward()` for forward mode, `Direct(...)` for both.
+      background: opaque linear RGB (3,) behind the volume; None leaves it transparent.
+
+    Returns:
+      image (height, width, 4): premultiplied linear RGBA in the volume's dtype, row 0 on top.
+
+    Raises:
+      ValueError: for NaN or infinite operands. RenderError: if a ray could not be followed; both
+        only where values are concrete, that is not inside your own `jit`.
+
+    Differentiable in `volume.values`, `volume.points`, `transfer` (positions, colors, extinctions),
+    `camera` (eye, target, up, fov or extent) and `background`. Notes on kinks are with `RayCast`,
+    `jaxvr.optics.partition` and the adjoints.
+    """
+    pipeline = Pipeline(tracer or RayCast(), integrator or Analytic(), compositor or Over())
+    camera = _camera_of(camera, volume)
+    transfer = _transfer_of(transfer, volume)
+    image, status = _render(
+        pipeline, adjoint or Replay(), volume, camera, transfer, _background(background)
+    )
+    if is_concrete(status):
+        check(status)
+    return image
+
+
+def render_rays(
+    volume: Any,
+    origins: Any,
+    directions: Any,
+    transfer: TransferFunction,
+    *,
+    tracer: AbstractTracer | None = None,
+    integrator: AbstractIntegrator | None = None,
+    compositor: Over | None = None,
+    adjoint: AbstractAdjoint | None = None,
+    background: Any = None,
+    status: bool = False,
+) -> Any:
+    """The colours that rays see.
+
+    Args:
+      origins, directions (..., 3): rays from the origins onwards; origins may be in the volume.
+        Directions of any length but zero: optical lengths are world lengths. Neighbours in the
+        array should be neighbours in space, for speed.
+      status: also return the status bits (...,) int32 of each ray, for `jaxvr.check`.
+      The rest as for `render`.
+
+    Returns:
+      rgba (..., 4), premultiplied linear, in the volume's dtype. Differentiable in origins and
+      directions too.
+    """
+    pipeline = Pipeline(tracer or RayCast(), integrator or Analytic(), compositor or Over())
+    origins, directions = _rays_of(origins, directions, volume)
+    transfer = _transfer_of(transfer, volume)
+    rgba, bits = _render_rays(
+        *(pipeline, adjoint or Replay(), volume, origins, directions, transfer),
+        _background(background),
+    )
+    if status:
+        return rgba, bits
+    if is_concrete(bits):
+        check(bits)
+    return rgba
+
+
+def trace(
+    volume: Any, camera: Camera | tuple[Any, Any], *, tracer: AbstractTracer | None = None
+) -> Segments:
+    """The segments along the rays of a camera, to be shaded as often as you like.
+
+    Args:
+      camera: a camera, or rays (origins, directions) with shapes (..., 3).
+
+    Returns:
+      Segments, 8 bytes each in float32 (see `Segments`). They are constants: for gradients with
+      respect to the mesh or the camera use `render`.
+
+    Not for use inside `jit`: how many segments there are is known only when they are found.
+    """
+    if not is_concrete(*jax.tree.leaves((volume, camera))):
+        raise ValueError(
+            "trace cannot run inside jit or grad, since the number of segments decides the shape "
+            "of its result. Call it outside and pass its result in, or use render."
+        )
+    tracer = tracer or RayCast()
+    if isinstance(camera, Camera):
+        camera = _camera_of(camera, volume)
+        shape, order = (camera.height, camera.width), _tiles(camera.height, camera.width)
+        origins, directions = (x.reshape(-1, 3)[order] for x in camera.rays())
+    else:
+        origins, directions = _rays_of(*camera, volume)
+        shape, order = origins.shape[:-1], np.arange(origins.size // 3)
+        origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+    counts, status = _count(tracer, volume, origins, directions)
+    counts = np.asarray(counts)
+    check(status)
+    start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    if start[-1] >= 2**31:
+        raise ValueError(f"{start[-1]} nodes do not fit 32-bit indices. Trace fewer rays at once.")
+    # Buffers are as long as the next multiple, so that similar views share a compiled function.
+    total = -(-max(int(start[-1]), 1) // (1 << 16)) << 16
+    nodes, segments = _fill(
+        tracer, volume, origins, directions, start[:-1].astype(np.int32), total
+    )
+    return Segments(
+        nodes.scalar,
+        nodes.length,
+        jnp.asarray(start, jnp.int32),
+        jnp.asarray(status),
+        jnp.asarray(order, jnp.int32),
+        shape=tuple(shape),
+        count=int(start[-1]),
+    )
+
+
+def shade(
+    segments: Segments,
+    transfer: TransferFunction,
+    *,
+    integrator: AbstractIntegrator | None = None,
+    compositor: Over | None = None,
+    adjoint: AbstractAdjoint | None = None,
+    background: Any = None,
+) -> Array:
+    """The image of traced segments: what `render` gives, without the walk.
+
+    Args:
+      segments: from `trace`. The rest as for `render`.
+
+    Returns:
+      image (height, width, 4), or (..., 4) for segments of rays. Differentiable in `transfer`,
+      `segments.scalar`, `segments.length` and `background`.
+    """
+    pipeline = Pipeline(Recorded(), integrator or Analytic(), compositor or Over())
+    transfer = _transfer_of(transfer, segments)
+    return _shade(pipeline, adjoint or Replay(), segments, transfer, _background(background))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _render(pipeline, adjoint, volume, camera, transfer, background):
+    height, width = camera.height, camera.width
+    order = _tiles(height, width)
+    origins, directions = (x.reshape(-1, 3)[order] for x in camera.rays())
+    rgba, status = _run(pipeline, adjoint, volume, origins, directions, transfer)
+    rgba = _over(_untile(rgba, order), background)
+    return rgba.reshape(height, width, 4), _untile(status, order).reshape(height, width)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _render_rays(pipeline, adjoint, volume, origins, directions, transfer, background):
+    shape = origins.shape[:-1]
+    rgba, status = _run(
+        pipeline, adjoint, volume, origins.reshape(-1, 3), directions.reshape(-1, 3), transfer
+    )
+    return _over(rgba, background).reshape(*shape, 4), status.reshape(shape)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _shade(pipeline, adjoint, segments, transfer, background):
+    scene = pipeline.tracer.prepare(segments)
+    rays, count = _batches((segments.start[:-1], segments.start[1:]))
+    rays = pipeline.tracer.prepare_rays(scene, *rays)
+    rgba = _finish(pipeline, adjoint, scene, rays, transfer, scene.scalar.dtype, count)[0]
+    rgba = jnp.zeros_like(rgba).at[segments.order].set(rgba, unique_indices=True)
+    return _over(rgba, background).reshape(*segments.shape, 4)
+
+
+@partial(jax.jit, static_argnums=0)
+def _count(tracer, volume, origins, directions):
+    scene = tracer.prepare(volume)
+    rays, count = _batches((origins, directions))
+    rays = jax.vmap(partial(tracer.prepare_rays, scene))(*rays)
+    return tuple(x.reshape(-1)[:count] for x in record(tracer, scene, rays))
+
+
+@partial(jax.jit, static_argnums=(0, 5))
+def _fill(tracer, volume, origins, directions, start, total):
+    scene = tracer.prepare(volume)
+    (origins, directions, start), _ = _batches((origins, directions, start))
+    rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
+    return fill(tracer, scene, rays, start, total), None
+
+
+def _run(pipeline, adjoint, volume, origins, directions, transfer):
+    """rgba (R, 4) and status (R,) of rays (R, 3)."""
+    scene = pipeline.tracer.prepare(volume)
+    rays, count = _batches((origins, directions))
+    rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(*rays)
+    return _finish(pipeline, adjoint, scene, rays, transfer, origins.dtype, count)
+
+
+def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):
+    table = pipeline.integrator.prepare(transfer, dtype)
+    rgba, status = adjoint.run(pipeline, Operands(scene, rays, table))
+    return jnp.moveaxis(rgba, 1, 2).reshape(-1, 4)[:count], status.reshape(-1)[:count]
+
+
+def _batches(arrays: Any) -> tuple[Any, int]:
+    """Arrays (R, ...) as batches (n, BATCH, ...), the last filled up with copies; and R."""
+    count = arrays[0].shape[0]
+    size = min(BATCH, max(count, 1))
+    number = -(-count // size)
+
+    def split(x):
+        x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (number * size - count, *x.shape[1:]))])
+        return x.reshape(number, size, *x.shape[1:])
+
+    return tuple(split(x) for x in arrays), count
+
+
+def _tiles(height: int, width: int, side: int = 16) -> np.ndarray:
+    """Pixel numbers, tile by tile: neighbours in the list are neighbours in the image."""
+    rows, columns = np.mgrid[0:height, 0:width]
+    key = (rows // side, columns // side, rows, columns)
+    return np.lexsort([k.ravel() for k in reversed(key)]).astype(np.int32)
+
+
+def _untile(x: Array, order: np.ndarray) -> Array:
+    inverse = np.empty_like(order)
+    inverse[order] = np.arange(order.size, dtype=order.dtype)
+    return x[inverse]
+
+
+def _over(rgba: Array, background: Array | None) -> Array:
+    if background is None:
+        return rgba
+    behind = jnp.concatenate([background.astype(rgba.dtype), jnp.ones(1, rgba.dtype)])
+    return rgba + (1 - rgba[..., 3:]) * behind[None]
+
+
+def _background(background: Any) -> Any:
+    if background is None:
+        return None
+    background = as_floats("background", background, ndim=1)
+    if background.shape != (3,):
+        raise ValueError(f"background must be RGB with shape (3,), but has {background.shape}.")
+    require_finite("background", background)
+    return jnp.asarray(background)
+
+
+def _dtype_of(volume: Any) -> Any:
+    return volume.scalar.dtype if isinstance(volume, Segments) else volume.points.dtype
+
+
+def _cast(tree: Any, dtype: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), tree)
+
+
+def _camera_of(camera: Any, volume: Any) -> Camera:
+    if not isinstance(camera, Camera):
+        raise ValueError(f"camera must be a jaxvr.Camera, but is a {type(camera).__name__}.")
+    for name in ("eye", "target", "up", "fov", "extent"):
+        part = getattr(camera, name)
+        if part is not None:
+            require_finite(f"camera.{name}", part)
+    return _cast(camera, _dtype_of(volume))
+
+
+def _transfer_of(transfer: Any, volume: Any) -> TransferFunction:
+    if not isinstance(transfer, TransferFunction):
+        raise ValueError(
+            f"transfer must be a jaxvr.TransferFunction, but is a {type(transfer).__name__}."
+        )
+    return _cast(transfer, _dtype_of(volume))
+
+
+def _rays_of(origins: Any, directions: Any, volume: Any) -> tuple[Array, Array]:
+    dtype = _dtype_of(volume)
+    origins, directions = as_floats("origins", origins), as_floats("directions", directions)
+    for name, x in (("origins", origins), ("directions", directions)):
+        if x.ndim == 0 or x.shape[-1] != 3:
+            raise ValueError(f"{name} must have shape (..., 3), but has {x.shape}.")
+        require_finite(name, x)
+    shape = np.broadcast_shapes(origins.shape, directions.shape)
+    if 0 in shape:
+        raise ValueError(f"There are no rays: their shape is {shape}.")
+    if is_concrete(directions):
+        none = ~np.asarray(directions).any(-1)
+        if none.any():
+            first = tuple(int(i) for i in np.argwhere(none)[0])
+            raise ValueError(f"{int(none.sum())} direction(s) are zero, the first at {first}.")
+    origins, directions = (
+        jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in (origins, directions)
+    )
+    return origins, directions

@@ -1,0 +1,114 @@
+"""What a walk gathers from: a tetrahedral mesh laid out for single loads.
+
+Coordinates lie one axis after the other, so that a ray's permuted axes cost an addition; ids and
+neighbours lie flat. Points that coincide (see `TetMesh.duplicates`) are one point, at their
+common mean: under a gradient step they move together, and the walk cannot fall between them.
+
+Everything is scaled by a power of two that brings coordinates near 1. That is exact, and keeps
+products of projected coordinates clear of underflow whatever the user's unit of length is.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxvr._core.pytree import pytree, static
+from jaxvr._core.stage import stage
+from jaxvr.trace.shear import ShearedRays, shear_points
+from jaxvr.volume.mesh import TetMesh
+
+Array = jax.Array
+
+
+@pytree
+class Scene:
+    """A mesh of P points, T cells and F boundary faces.
+
+    coordinates (3 P,): all x, all y, all z, times `scale` ().
+    values (V,): as in the mesh, flat. cells (4 T,), neighbors (4 T,): flat, see `TetMesh`.
+    faces (L,): `TetMesh.boundary` padded by -1 to a power of two.
+    location: where the values live. seams: whether some points coincide.
+    """
+
+    coordinates: Array
+    values: Array
+    cells: Array
+    neighbors: Array
+    faces: Array
+    scale: Array
+    location: str = static(default="point")
+    seams: bool = static(default=False)
+
+    @property
+    def continuous(self) -> bool:
+        """Whether the scalar is the same on both sides of every face (seams apart)."""
+        return self.location == "point"
+
+
+def make_scene(mesh: TetMesh) -> Scene:
+    points = merged_points(mesh)
+    largest = jnp.max(jnp.abs(lax.stop_gradient(points)))
+    exponent = jnp.where(largest > 0, -jnp.frexp(jnp.where(largest > 0, largest, 1))[1], 0)
+    scale = jnp.ldexp(jnp.ones((), points.dtype), exponent)
+    count = mesh.boundary.shape[0]
+    leaves = 1 << max(count - 1, 1).bit_length()
+    faces = jnp.concatenate([mesh.boundary, jnp.full(leaves - count, -1, jnp.int32)])
+    return Scene(
+        coordinates=(points * scale).T.reshape(-1),
+        values=mesh.values.reshape(-1),
+        cells=mesh.cells.reshape(-1),
+        neighbors=mesh.neighbors.reshape(-1),
+        faces=faces,
+        scale=scale,
+        location=mesh.location,
+        seams=mesh.duplicates.shape[0] > 0,
+    )
+
+
+def merged_points(mesh: TetMesh) -> Array:
+    """points (P, 3) with coinciding ones moved to the mean of each group."""
+    copies = mesh.duplicates
+    if copies.shape[0] == 0:
+        return mesh.points
+    copy, first = copies[:, 0], copies[:, 1]
+    # The mean is the first point plus the mean of differences: exact when all are equal.
+    away = mesh.points[copy] - mesh.points[first]
+    group = jnp.ones(mesh.points.shape[0], away.dtype).at[first].add(1.0)
+    mean = mesh.points.at[first].add(away / group[first][:, None])
+    return mean.at[copy].set(mean[first])
+
+
+def local_ids(scene: Scene, cell: Array, corner: Array) -> Array:
+    """Point id at a local corner (R,) of a cell (R,)."""
+    return scene.cells[4 * cell + corner]
+
+
+def value_slots(scene: Scene, cell: Array, corner: Array, point: Array) -> Array:
+    """Index into `values` of the scalar at a corner of a cell."""
+    if scene.location == "point":
+        return point
+    return cell if scene.location == "cell" else 4 * cell + corner
+
+
+def fetch(scene: Scene, rays: ShearedRays, cell: Array, corner: Array, wanted: Array) -> Array:
+    """The vertex (5, R) at a local corner of a cell, as each ray sees it; see `shear`.
+
+    wanted (): whether any ray needs it.
+    """
+    count = scene.coordinates.shape[0] // 3
+    axes = (rays.axis_x, rays.axis_y, rays.axis_z)
+
+    def load(scene, axes, cell, corner):
+        point = local_ids(scene, cell, corner)
+        at = [scene.coordinates[axis * count + point] for axis in axes]
+        return *at, scene.values[value_slots(scene, cell, corner, point)]
+
+    *point, value = stage(wanted, load, scene, axes, cell, corner)
+    return jnp.stack([*stage(wanted, shear_points, rays, *point), value])
+
+
+def entry_corners(corner: Array) -> tuple[Array, Array, Array]:
+    """Local indices, ascending, of the three vertices of the face opposite `corner`."""
+    return tuple(k + (corner <= k).astype(jnp.int32) for k in range(3))  # type: ignore

@@ -1,0 +1,315 @@
+"""`Camera`: a pinhole or an orthographic view, and the ray through each pixel's centre.
+
+With `forward = normalize(target - eye)`, `right = normalize(forward x up)` and
+`true_up = right x forward`, pixel (i, j) (row 0 on top) lies at
+
+    x = ((2j + 1)/width - 1) * h * width/height,    y = (1 - (2i + 1)/height) * h,
+
+where `h` is tan(fov/2) for a pinhole and extent/2 for an orthographic camera. A pinhole's rays
+start at the eye along normalize(forward + x*right + y*true_up); orthographic rays start at
+eye + x*right + y*true_up along `forward`. What lies behind the start of a ray is not seen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import operator
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvr._core.checks import (
+    as_floats,
+    default_float,
+    float_dtype,
+    is_concrete,
+    require_finite,
+    require_shape,
+)
+from jaxvr._core.pytree import pytree, static
+
+Array = jax.Array
+
+
+class HasBounds(Protocol):
+    """Anything that a camera can orbit."""
+
+    def bounds(self) -> tuple[Any, Any]:
+        """The lower and the upper corner (3,), (3,) of the axis-aligned bounding box."""
+        ...
+
+
+@pytree
+class Camera:
+    """A view of the world. Make one with `look_at`, `orthographic`, `orbit` or `sphere`.
+
+    eye (3,):     where the camera stands, in world units.
+    target (3,):  a point in the middle of the picture.
+    up (3,):      the direction that points up in the picture; need not be perpendicular or unit.
+    fov ():       full vertical angle in degrees of a pinhole camera, else None.
+    extent ():    full vertical height in world units of an orthographic camera, else None.
+    width, height: pixels; part of the tree's structure.
+
+    The arrays share one dtype, which is that of the rays. The rays are differentiable in eye,
+    target, up and fov or extent. The factories and `replace` check their arguments (values only
+    when they are concrete); calling the class itself checks nothing.
+    """
+
+    eye: Array
+    target: Array
+    up: Array
+    fov: Array | None
+    extent: Array | None
+    width: int = static(default=512)
+    height: int = static(default=512)
+
+    @staticmethod
+    def look_at(
+        eye: Any,
+        target: Any,
+        up: Any = (0.0, 1.0, 0.0),
+        fov: Any = 30.0,
+        width: int = 512,
+        height: int = 512,
+        *,
+        dtype: Any = None,
+    ) -> Camera:
+        """A pinhole camera at `eye` (3,) that looks at `target` (3,).
+
+        `dtype` defaults to that of the arrays among eye, target and up, and to JAX's default float
+        when these are plain numbers. Raises ValueError for numbers that are not finite, eye equal
+        to target, up along the view, fov outside (0, 180), a picture without pixels.
+        """
+        return _make(eye, target, up, fov, None, width, height, dtype)
+
+    @staticmethod
+    def orthographic(
+        eye: Any,
+        target: Any,
+        up: Any = (0.0, 1.0, 0.0),
+        extent: Any = 1.0,
+        width: int = 512,
+        height: int = 512,
+        *,
+        dtype: Any = None,
+    ) -> Camera:
+        """A camera with parallel rays that start in the plane through `eye`.
+
+        `extent` is the full height of the picture in world units. Otherwise as `look_at`.
+        """
+        return _make(eye, target, up, None, extent, width, height, dtype)
+
+    @staticmethod
+    def orbit(
+        volume: HasBounds,
+        azimuth: Any = 30.0,
+        elevation: Any = 20.0,
+        fov: Any = 30.0,
+        zoom: Any = 1.0,
+        width: int = 512,
+        height: int = 512,
+        *,
+        dtype: Any = None,
+    ) -> Camera:
+        """A pinhole camera on a sphere round the volume; at zoom 1 its bounding ball fits the fov.
+
+        target = centre of the bounding box, R = half its diagonal, eye = target
+        + R/sin(fov/2)/zoom * (cos(el) sin(az), sin(el), cos(el) cos(az)), up = (0, 1, 0). Angles
+        are in degrees. The dtype defaults to that of `volume.bounds()`. Raises ValueError as
+        `look_at` does, and for zoom <= 0 and for an elevation of +-90 degrees (up would point along
+        the view: use `look_at` with another up).
+        """
+        lo, hi = volume.bounds()
+        given = getattr(lo, "dtype", None)
+        dtype = _dtype(dtype, lo) if given is None or dtype is not None else float_dtype(given)
+        named = {"azimuth": azimuth, "elevation": elevation, "fov": fov, "zoom": zoom}
+        az, el, angle, magnification = (_scalar(name, x, dtype) for name, x in named.items())
+        _require_between("fov", angle, 0.0, 180.0, "degrees")
+        _require_between("zoom", magnification, 0.0, math.inf)
+        corners = [jnp.asarray(as_floats("bounds", c, ndim=1, dtype=dtype)) for c in (lo, hi)]
+        target = 0.5 * (corners[0] + corners[1])
+        radius = 0.5 * jnp.linalg.norm(corners[1] - corners[0])
+        distance = radius / jnp.sin(jnp.deg2rad(angle) / 2) / magnification
+        az, el = jnp.deg2rad(az), jnp.deg2rad(el)
+        outward = jnp.stack([jnp.cos(el) * jnp.sin(az), jnp.sin(el), jnp.cos(el) * jnp.cos(az)])
+        eye = target + distance * outward
+        return _make(eye, target, (0.0, 1.0, 0.0), angle, None, width, height, dtype)
+
+    @staticmethod
+    def sphere(
+        volume: HasBounds,
+        n: int,
+        fov: Any = 30.0,
+        zoom: Any = 1.0,
+        width: int = 512,
+        height: int = 512,
+        *,
+        dtype: Any = None,
+    ) -> list[Camera]:
+        """`n` orbiting cameras spread evenly over the sphere, on a Fibonacci lattice.
+
+        View k has sin(elevation) = 1 - (2k + 1)/n and azimuth k times the golden angle
+        (González, "Measurement of areas on a sphere using Fibonacci and latitude-longitude
+        lattices", 2010); no view looks along up. DiffDVR (Weiss and Westermann, 2021) fits to
+        eight such views.
+        """
+        n = _positive("n", n)
+        golden = 180.0 * (3.0 - math.sqrt(5.0))
+        return [
+            Camera.orbit(
+                volume,
+                azimuth=math.fmod(k * golden, 360.0),
+                elevation=math.degrees(math.asin(1.0 - (2 * k + 1) / n)),
+                fov=fov,
+                zoom=zoom,
+                width=width,
+                height=height,
+                dtype=dtype,
+            )
+            for k in range(n)
+        ]
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The dtype of the rays."""
+        return np.dtype(self.eye.dtype)
+
+    def replace(self, **changes: Any) -> Camera:
+        """This camera with some fields changed, checked as the factories do.
+
+        Passing `fov` to an orthographic camera, or `extent` to a pinhole, turns it into the other
+        kind. The dtype stays.
+        """
+        names = {f.name for f in dataclasses.fields(self)}
+        if unknown := set(changes) - names:
+            raise ValueError(f"A camera has no {sorted(unknown)}, only {sorted(names)}.")
+        old = {name: getattr(self, name) for name in names}
+        if changes.get("fov") is not None:
+            old["extent"] = None
+        elif changes.get("extent") is not None:
+            old["fov"] = None
+        new = old | changes
+        return _make(**new, dtype=self.dtype)
+
+    def basis(self) -> tuple[Array, Array, Array]:
+        """The unit vectors right, true_up and forward, (3,) each."""
+        forward = _normalize(self.target - self.eye)
+        right = _normalize(jnp.cross(forward, self.up))
+        return right, jnp.cross(right, forward), forward
+
+    def rays(self) -> tuple[Array, Array]:
+        """Origins and unit directions (height, width, 3), (height, width, 3), one ray a pixel."""
+        return _rays(self)
+
+
+@jax.jit
+def _rays(camera: Camera) -> tuple[Array, Array]:
+    w, h, dtype = camera.width, camera.height, camera.dtype
+    if camera.fov is not None:
+        half = jnp.tan(jnp.deg2rad(camera.fov) / 2)
+    else:
+        assert camera.extent is not None
+        half = camera.extent / 2
+    # The pixel grid is a constant, rounded once from float64.
+    x = jnp.asarray(((2 * np.arange(w) + 1) / w - 1) * (w / h), dtype) * half
+    y = jnp.asarray(1 - (2 * np.arange(h) + 1) / h, dtype) * half
+    right, true_up, forward = (v[None, None, :] for v in camera.basis())
+    offset = x[None, :, None] * right + y[:, None, None] * true_up
+    if camera.fov is not None:
+        directions = _normalize(forward + offset)
+        return jnp.broadcast_to(camera.eye, offset.shape), directions
+    return camera.eye[None, None, :] + offset, jnp.broadcast_to(forward, offset.shape)
+
+
+def _normalize(v: Array) -> Array:
+    return v / jnp.sqrt(jnp.sum(v * v, axis=-1, keepdims=True))
+
+
+def _make(
+    eye: Any, target: Any, up: Any, fov: Any, extent: Any, width: Any, height: Any, dtype: Any
+) -> Camera:
+    dtype = _dtype(dtype, eye, target, up)
+    eye, target, up = (_vector(*v, dtype) for v in (("eye", eye), ("target", target), ("up", up)))
+    if fov is not None and extent is not None:
+        raise ValueError("A camera has a fov (pinhole) or an extent (orthographic), not both.")
+    if fov is not None:
+        fov = _scalar("fov", fov, dtype)
+        _require_between("fov", fov, 0.0, 180.0, "degrees")
+    elif extent is not None:
+        extent = _scalar("extent", extent, dtype)
+        _require_between("extent", extent, 0.0, math.inf, "world units")
+    else:
+        raise ValueError("A camera needs a fov (pinhole) or an extent (orthographic).")
+    _require_view(eye, target, up, dtype)
+    width, height = _positive("width", width), _positive("height", height)
+    return Camera(
+        jnp.asarray(eye), jnp.asarray(target), jnp.asarray(up), fov, extent, width, height
+    )
+
+
+def _dtype(dtype: Any, *arrays: Any) -> np.dtype:
+    """The dtype asked for, else the widest float among the arrays, else JAX's default."""
+    if dtype is not None:
+        return float_dtype(dtype)
+    floats = [
+        a.dtype for a in arrays if hasattr(a, "dtype") and jnp.issubdtype(a.dtype, jnp.floating)
+    ]
+    return float_dtype(jnp.result_type(*floats)) if floats else default_float()
+
+
+def _vector(name: str, x: Any, dtype: Any) -> Any:
+    x = as_floats(name, x, dtype=dtype)
+    require_shape(name, x, (3,))
+    require_finite(name, x)
+    return x
+
+
+def _scalar(name: str, x: Any, dtype: Any) -> Array:
+    x = as_floats(name, x, dtype=dtype)
+    require_shape(name, x, ())
+    return jnp.asarray(x)
+
+
+def _require_between(name: str, x: Any, low: float, high: float, unit: str = "") -> None:
+    if is_concrete(x) and not low < float(x) < high:
+        unit = f" {unit}" if unit else ""
+        raise ValueError(
+            f"{name} must lie between {low:g} and {high:g}{unit}, but is {float(x):g}."
+        )
+
+
+def _positive(name: str, n: Any) -> int:
+    try:
+        if isinstance(n, bool | np.bool_):
+            raise TypeError
+        n = operator.index(n)
+    except TypeError:
+        raise ValueError(f"{name} must be a whole number, but is {n!r}.") from None
+    if n < 1:
+        raise ValueError(f"{name} must be at least 1, but is {n}.")
+    return n
+
+
+def _require_view(eye: Any, target: Any, up: Any, dtype: Any) -> None:
+    if not is_concrete(eye, target, up):
+        return
+    eye, target, up = (np.asarray(v, np.float64) for v in (eye, target, up))
+    forward = target - eye
+    if not forward.any():
+        raise ValueError(f"eye and target are the same point {eye.tolist()}: there is no view.")
+    if not up.any():
+        raise ValueError("up is the zero vector; pass a direction such as (0, 1, 0).")
+    sine = np.linalg.norm(np.cross(_unit(forward), _unit(up)))
+    if sine < 16 * np.finfo(dtype).eps:
+        raise ValueError(
+            f"up {up.tolist()} is parallel to the view direction {_unit(forward).tolist()}; "
+            "pass another up."
+        )
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    v = v / np.abs(v).max()
+    return v / np.linalg.norm(v)

@@ -1,0 +1,248 @@
+"""From points, cells and values as people have them to the arrays of a `TetMesh` (all NumPy).
+
+The steps, each a function below or in a file beside this one: name the cell types (`cells`), check
+the indices, weld, subdivide, drop what has no volume, turn what is inverted, sort each row by
+welded id, match the faces, find the fold bits, and put the boundary in order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._core.checks import as_floats, default_float, float_dtype, is_concrete, require_finite
+from . import cells as zoo
+from . import connectivity as conn
+from .geometry import signed_volumes
+from .packing import MAX_CELLS
+from .report import MeshReport
+from .weld import weld
+
+# comparators of a sorting network for four keys
+_NETWORK = ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2))
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """Input cells of one type. corners (N, n): point ids in VTK's order."""
+
+    name: str
+    kind: zoo.CellKind
+    corners: np.ndarray
+
+
+def mesh_dtype(points: Any, dtype: Any) -> np.dtype:
+    """float64 where x64 is on and the points (or `dtype`) ask for it, else float32."""
+    if dtype is None:
+        given = getattr(points, "dtype", None)
+        if given is None:
+            try:
+                given = np.asarray(points).dtype
+            except Exception:
+                return default_float()
+        return float_dtype(given) if np.dtype(given).kind == "f" else default_float()
+    try:
+        want = np.dtype(dtype)
+    except TypeError as e:
+        raise ValueError(f"dtype must be float32 or float64, but is {dtype!r}.") from e
+    if want not in (np.float32, np.float64):
+        raise ValueError(f"dtype must be float32 or float64, but is {want}.")
+    if want == np.float64 and default_float() != np.float64:
+        raise ValueError(
+            'dtype float64 needs 64-bit JAX: jax.config.update("jax_enable_x64", True) first.'
+        )
+    return want
+
+
+def floats(name: str, x: Any, dtype: np.dtype) -> np.ndarray:
+    """x as a finite NumPy array of this dtype, or a ValueError that names it."""
+    if not is_concrete(x):
+        raise ValueError(
+            f"{name} is traced, but building a mesh finds integers from its values. Build the mesh "
+            "outside jit and grad, and use mesh.replace(points=..., values=...) inside."
+        )
+    array = as_floats(name, np.asarray(x) if isinstance(x, jax.Array) else x, dtype=np.float64)
+    require_finite(name, array)
+    with np.errstate(over="ignore", under="ignore"):
+        out = array.astype(dtype)
+    if not np.isfinite(out).all():
+        i = int(np.argmax(np.abs(array).ravel()))
+        raise ValueError(
+            f"{name} overflows {dtype}: the largest is {array.ravel()[i]:g}. Scale it."
+        )
+    return out
+
+
+def read_points(points: Any, dtype: Any) -> np.ndarray:
+    out = floats("points", points, mesh_dtype(points, dtype))
+    if out.ndim != 2 or out.shape[1] != 3:
+        raise ValueError(f"points must have shape (P, 3), but has {out.shape}.")
+    if len(out) == 0:
+        raise ValueError("The mesh is empty: points has shape (0, 3).")
+    return out
+
+
+def read_indices(name: str, x: Any, nodes: int | None, corners: int, n_points: int) -> np.ndarray:
+    """Cell indices (N, nodes) as int64, in range, or a ValueError that names the cell type."""
+    try:
+        ids = np.asarray(x)
+    except Exception as e:
+        raise ValueError(f"cells[{name!r}] cannot be read as an array: {e}") from e
+    if ids.size == 0 and ids.dtype.kind in "fiu":
+        return np.zeros((0, corners if nodes is None else nodes), np.int64)
+    if ids.dtype.kind not in "iu":
+        raise ValueError(f"cells[{name!r}] must hold integers, but has dtype {ids.dtype}.")
+    width = f"at least {corners}" if nodes is None else str(nodes)
+    if ids.ndim != 2 or (ids.shape[1] < corners if nodes is None else ids.shape[1] != nodes):
+        raise ValueError(f"cells[{name!r}] must have shape (N, {width}), but has {ids.shape}.")
+    bad = (ids < 0) | (ids >= n_points)
+    if bad.any():
+        row, col = (int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"cells[{name!r}] has {int(bad.sum())} indices out of range, the first at "
+            f"({row}, {col}): {int(ids[row, col])}, where 0 to {n_points - 1} are points."
+        )
+    return ids.astype(np.int64)
+
+
+def read_blocks(cells: Any, n_points: int) -> tuple[list[Block], dict[str, int], dict[str, int]]:
+    """The solid blocks in their order; counts of cells reduced to corners and of cells ignored."""
+    if not isinstance(cells, Mapping):
+        raise ValueError(
+            'cells must be a dict from type to indices, such as {"tetra": (N, 4)}, but is '
+            f"{type(cells).__name__}."
+        )
+    blocks, reduced, ignored = [], {}, {}
+    for name, x in cells.items():
+        kind, nodes, corners = zoo.canonical(name)
+        label = str(name)
+        if kind is None:
+            ignored[label] = len(x)
+            continue
+        assert corners is not None
+        ids = read_indices(label, x, nodes, kind.n_corners, n_points)
+        if ids.shape[1] > kind.n_corners and len(ids):
+            reduced[label] = len(ids)
+        blocks.append(Block(label, kind, ids[:, corners]))
+    if sum(len(b.corners) for b in blocks) == 0:
+        found = ", ".join(f"{n} {t}" for t, n in ignored.items()) or "none at all"
+        raise ValueError(f"The mesh has no solid cells (found: {found}).")
+    return blocks, reduced, ignored
+
+
+def sort_rows(tets: np.ndarray, welded: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How to sort each row by welded id: local order (T, 4) and whether it is odd (T,) bool."""
+    ids = welded[tets]
+    order = np.tile(np.arange(4, dtype=np.int8), (len(tets), 1))
+    odd = np.zeros(len(tets), bool)
+    for i, j in _NETWORK:
+        swap = ids[:, i] > ids[:, j]
+        for a in (ids, order):
+            a[swap, i], a[swap, j] = a[swap, j], a[swap, i]
+        odd ^= swap
+    return order, odd
+
+
+@dataclasses.dataclass(frozen=True)
+class Built:
+    """Arrays of a `TetMesh` without its values. parent (T,): the input cell of each tetrahedron,
+    counted over all blocks; order (T, 4): which corner of it (for tetra) each row entry is."""
+
+    points: np.ndarray
+    cells: np.ndarray
+    neighbors: np.ndarray
+    boundary: np.ndarray
+    duplicates: np.ndarray
+    parent: np.ndarray
+    order: np.ndarray
+    n_input: int
+    all_tetra: bool
+    block_sizes: tuple[tuple[str, int], ...]
+    report: MeshReport
+
+
+def _input_name(i: int, blocks: list[Block]) -> str:
+    for b in blocks:
+        if i < len(b.corners):
+            return f"{b.name} {i}"
+        i -= len(b.corners)
+    raise AssertionError
+
+
+def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Built:
+    """Everything but the values. Raises ValueError as `TetMesh.from_cells` says."""
+    pts = read_points(points, dtype)
+    blocks, reduced, ignored = read_blocks(cells, len(pts))
+    welded, duplicates = weld(pts)
+
+    tets, parent, sign, start = [], [], [], 0
+    for b in blocks:
+        t, p = zoo.subdivide(b.kind, b.corners, welded)
+        ids = welded[t]
+        _, s = signed_volumes(pts, t)
+        for i in range(4):
+            for j in range(i):
+                s[ids[:, i] == ids[:, j]] = 0
+        # two node orders are in use for wedges (see cells.WEDGE); the sign of most tells which
+        if b.kind is zoo.WEDGE and int(s.sum(dtype=np.int64)) < 0:
+            s = -s
+            t = t[:, [0, 2, 1, 3]]
+        tets.append(t)
+        parent.append(p + start)
+        sign.append(s)
+        start += len(b.corners)
+    t, p, s = np.concatenate(tets), np.concatenate(parent), np.concatenate(sign)
+    made = len(t)
+    keep = s != 0
+    if not keep.all():
+        t, p, s = t[keep], p[keep], s[keep]
+    if len(t) == 0:
+        raise ValueError(
+            f"No cells left: all {made} tetrahedra are degenerate (no volume, or a repeated point)."
+        )
+    if len(t) > MAX_CELLS:
+        raise ValueError(f"The mesh has {len(t)} tetrahedra; {MAX_CELLS} is the most that fit.")
+
+    order, odd = sort_rows(t, welded)
+    rows = np.take_along_axis(t, order.astype(np.intp), 1)
+    orientation = np.where(odd, -s, s)
+    try:
+        pairs = conn.match_faces(welded[rows])
+    except conn.NonManifoldError as e:
+        names = ", ".join(dict.fromkeys(_input_name(int(p[c]), blocks) for c in e.cells))
+        raise ValueError(
+            f"{e}, in cells {names}. A volume has at most two cells to a face: remove the others."
+        ) from None
+    turned, one_sided = conn.combinatorial(orientation, pairs)
+    neighbors = conn.neighbor_words(rows, pairs, turned)
+    boundary = conn.boundary_words(pts, rows, neighbors, orientation, turned)
+    report = MeshReport(
+        input_cells=tuple((b.name, len(b.corners)) for b in blocks if len(b.corners)),
+        reduced=tuple(reduced.items()),
+        ignored=tuple(ignored.items()),
+        tets=len(t),
+        degenerate=made - len(t),
+        inverted=int((s < 0).sum()),
+        folded=int(turned.sum()),
+        seams=int(((neighbors >= 0) & ((neighbors >> 3) & 1 == 1)).sum()) // 2,
+        duplicate_points=len(duplicates),
+        one_sided=one_sided,
+        field=field,
+    )
+    return Built(
+        points=pts,
+        cells=rows.astype(np.int32),
+        neighbors=neighbors,
+        boundary=boundary,
+        duplicates=duplicates,
+        parent=p,
+        order=order,
+        n_input=start,
+        all_tetra=all(b.kind is zoo.TETRA for b in blocks if len(b.corners)),
+        block_sizes=tuple((b.name, len(b.corners)) for b in blocks),
+        report=report,
+    )

@@ -1,0 +1,185 @@
+"""The unstructured volume: tetrahedra, a scalar on them, and how they hang together."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._core.checks import as_floats, is_concrete, require_finite, require_shape
+from .._core.pytree import pytree, static
+from .build import build
+from .report import MeshReport
+from .values import choose_location, place
+
+Array = jax.Array
+
+
+@pytree
+class TetMesh:
+    """Tetrahedra with a scalar field. Make one with `TetMesh.from_cells` or `jaxvr.read_mesh`.
+
+    points (P, 3): as given; points that coincide are kept apart.
+    values (P,), (T,) or (T, 4): by `location`, "point", "cell" or "corner" (the corners in the
+        order of `cells`); the dtype is that of points.
+    cells (T, 4) int32: point ids. Each row is sorted by *welded* id, the smallest index among
+        points that coincide exactly; the four are distinct. So a face that two cells share lists
+        its vertices in the same order in both, and rows are not sorted by orientation.
+    neighbors (T, 4) int32: entry k is what lies across the face opposite local vertex k: -1 for
+        nothing, else a word (see `packing`): the neighbouring cell; which local vertex of it lies
+        opposite the face; `turned`, set where the neighbouring cell lies the wrong way round; and
+        the flag `seam`, set where the two cells use different, coincident points for the face.
+    boundary (F,) int32: a word for each face without a neighbour: cell, the local vertex f that
+        it omits, `turned` of this cell, and the flag `entry`: whether sigma > 0, where tau = 1 if
+        the row (as the mesh would be unfolded) is positively oriented, det(q1 - q0, q2 - q0,
+        q3 - q0) > 0, else -1, and sigma = tau if f is odd else -tau. In Morton order.
+    duplicates (n, 2) int32: every point that coincides with an earlier one, and its welded id.
+    location, report: static.
+
+    A cell is turned if its geometric orientation contradicts that of its neighbours, so that it
+    overlaps them (a fold, as in a crushed mesh). The bit says how the cell lies in the mesh *as it
+    was built*: `replace(points=...)` keeps all integers, so it is right for moves that turn no cell
+    over and keep coincident points together; after larger ones, build the mesh anew.
+    """
+
+    points: Array
+    values: Array
+    cells: Array
+    neighbors: Array
+    boundary: Array
+    duplicates: Array
+    location: str = static(default="point")
+    report: MeshReport = static(default=MeshReport())
+
+    @classmethod
+    def from_cells(
+        cls,
+        points: Any,
+        cells: Mapping[Any, Any],
+        values: Any,
+        *,
+        location: str | None = None,
+        dtype: Any = None,
+    ) -> TetMesh:
+        """A mesh from any mix of tetrahedra, hexahedra, wedges and pyramids.
+
+        points (P, 3): coordinates.
+        cells: from cell type to point ids (N, n). Types go by meshio's names ("tetra",
+            "hexahedron", "wedge", "pyramid"), VTK's names or numbers; nodes in VTK's order (for
+            wedges meshio's is as good). Quadratic cells are reduced to their corners; points, lines
+            and faces are ignored; the report counts both.
+        values: (P,) for points; (N,) for the given cells, in the order of the blocks, or a dict
+            from type to (n,); (N, 4) for corners, where all cells are tetra.
+        location: "point", "cell" or "corner"; `None` takes the one whose shape fits.
+        dtype: float32 or float64; `None` takes float64 if x64 is on and points are, else float32.
+
+        Zoo cells are cut into tetrahedra that conform (see `cells`). Tetrahedra without volume are
+        dropped and inverted ones turned round, with one warning that counts both.
+
+        Raises ValueError for arrays of the wrong shape or kind, indices out of range, NaN or
+        infinite numbers, an unknown cell type, faces with three or more cells, cells given twice,
+        values that fit nothing or more than one location, and where no cells are left.
+        """
+        return _from_cells(cls, points, cells, values, location, dtype, None, stacklevel=3)
+
+    def replace(self, *, values: Any = None, points: Any = None, location: Any = None) -> TetMesh:
+        """The same connectivity with new floats; works under `jit` and `grad`.
+
+        values: of the shape of any location, (P,), (T,) or (T, 4); where two fit, the present
+        location is kept, or `location` says which. points (P, 3): see the class on what may move.
+        Both are cast to the dtype of the points. Raises ValueError for other shapes and, outside
+        tracing, for NaN or infinite entries.
+        """
+        new: dict[str, Any] = {}
+        if points is not None:
+            new["points"] = self._floats("points", points)
+            require_shape("points", new["points"], self.points.shape)
+        if values is not None:
+            v = self._floats("values", values)
+            sizes = {"point": (self.n_points,), "cell": (self.n_tets,), "corner": self.cells.shape}
+            if location is None and v.shape == sizes[self.location]:
+                location = self.location
+            new["values"] = v
+            new["location"] = choose_location(v.shape, sizes, location)
+        elif location is not None:
+            raise ValueError("location says where values live: pass values too.")
+        return dataclasses.replace(self, **new)
+
+    def _floats(self, name: str, x: Any) -> Array:
+        if is_concrete(x):
+            require_finite(name, as_floats(name, x))
+        out = as_floats(name, x, dtype=self.points.dtype)
+        if is_concrete(out):
+            require_finite(name, out)
+        return jnp.asarray(out)
+
+    @property
+    def dtype(self) -> np.dtype:
+        return np.dtype(self.points.dtype)
+
+    @property
+    def n_points(self) -> int:
+        return self.points.shape[0]
+
+    @property
+    def n_tets(self) -> int:
+        return self.cells.shape[0]
+
+    @property
+    def n_boundary(self) -> int:
+        return self.boundary.shape[0]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays, on the device."""
+        return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(self))
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper corner (3,) of the box round the points that cells use."""
+        used = self.points[self.cells.reshape(-1)]
+        return used.min(axis=0), used.max(axis=0)
+
+    def describe(self) -> str:
+        """A page on the mesh for people: counts, repairs, components, boundary, box, quality,
+        field and bytes. `print(mesh.describe())`."""
+        from .describe import describe
+
+        return describe(self)
+
+    def __repr__(self) -> str:
+        # leaves may be tracers or placeholders
+        shape = getattr(self.cells, "shape", ("?",))
+        points = getattr(self.points, "shape", ("?",))
+        return f"TetMesh({shape[0]} tets, {points[0]} points, {self.location} data)"
+
+
+def _from_cells(
+    cls: type[TetMesh],
+    points: Any,
+    cells: Any,
+    values: Any,
+    location: str | None,
+    dtype: Any,
+    field: str | None,
+    stacklevel: int,
+) -> TetMesh:
+    built = build(points, cells, dtype, field)
+    placed, where = place(values, built, location)
+    message = built.report.warning()
+    if message:
+        warnings.warn(message, UserWarning, stacklevel=stacklevel)
+    return cls(
+        points=jnp.asarray(built.points),
+        values=jnp.asarray(placed),
+        cells=jnp.asarray(built.cells),
+        neighbors=jnp.asarray(built.neighbors),
+        boundary=jnp.asarray(built.boundary),
+        duplicates=jnp.asarray(built.duplicates),
+        location=where,
+        report=built.report,
+    )

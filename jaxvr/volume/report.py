@@ -1,0 +1,71 @@
+"""What was read, what was made of it and what was repaired: the static part of a `TetMesh`."""
+
+from __future__ import annotations
+
+import dataclasses
+
+Counts = tuple[tuple[str, int], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshReport:
+    """Counts from `TetMesh.from_cells`; hashable, so it may stand in a pytree's structure.
+
+    input_cells: cells by type as given. reduced: those of them reduced to their corners.
+    ignored: points, lines and faces among the cells, left out. degenerate, inverted: tetrahedra
+    dropped for having no volume, and given the wrong way round. folded: tetrahedra that lie the
+    wrong way round among their neighbours, whichever way they are written. seams: faces whose two
+    cells use different but coincident points. one_sided: components without a consistent
+    orientation. field: the field's name where it is known.
+    """
+
+    input_cells: Counts = ()
+    reduced: Counts = ()
+    ignored: Counts = ()
+    tets: int = 0
+    degenerate: int = 0
+    inverted: int = 0
+    folded: int = 0
+    seams: int = 0
+    duplicate_points: int = 0
+    one_sided: int = 0
+    field: str | None = None
+
+    @property
+    def n_input(self) -> int:
+        return sum(n for _, n in self.input_cells)
+
+    def warning(self) -> str | None:
+        """One sentence on what was repaired, or `None`."""
+        done = []
+        if self.degenerate:
+            done.append(f"{self.degenerate} degenerate tetrahedra (no volume) dropped")
+        if self.inverted:
+            done.append(f"{self.inverted} inverted tetrahedra turned round")
+        made = self.tets + self.degenerate
+        return f"{' and '.join(done)}, of {made} in the mesh." if done else None
+
+    def lines(self) -> list[tuple[str, str]]:
+        """The report for people: labels and what stands behind them."""
+
+        def listed(counts: Counts) -> str:
+            return ", ".join(f"{n:,} {name}" for name, n in counts) or "unknown"
+
+        repairs = ((self.degenerate, "degenerate dropped"), (self.inverted, "inverted turned"))
+        repaired = ", ".join(f"{n:,} {what}" for n, what in repairs if n) or "nothing"
+        out = [("cells given", listed(self.input_cells))]
+        if self.reduced:
+            out.append(("cut to corners", listed(self.reduced)))
+        if self.ignored:
+            out.append(("ignored", f"{listed(self.ignored)} (not solid)"))
+        out.append(("repaired", repaired))
+        if self.duplicate_points:
+            closing = (
+                f"{self.duplicate_points:,} coincide with others, closing {self.seams:,} faces"
+            )
+            out.append(("points", closing))
+        if self.folded:
+            out.append(("folded", f"{self.folded:,} tetrahedra overlap their neighbours"))
+        if self.one_sided:
+            out.append(("one-sided", f"{self.one_sided:,} components"))
+        return out

@@ -1,0 +1,114 @@
+"""Where the values of a field live: on points (P,), in cells (T,), or at cell corners (T, 4).
+
+All three are rendered as they are, without averaging: linear in each cell from its points, constant
+in it, or linear in it with jumps from cell to cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from .build import Built, floats
+
+LOCATIONS = ("point", "cell", "corner")
+
+
+def infer_location(shape: tuple[int, ...], sizes: dict[str, tuple[int, ...]]) -> list[str]:
+    """The locations whose shape this is. sizes: location to its shape."""
+    return [where for where, size in sizes.items() if shape == size]
+
+
+def check_location(location: Any) -> None:
+    if location is not None and location not in LOCATIONS:
+        raise ValueError(f"location must be one of {LOCATIONS} or None, but is {location!r}.")
+
+
+def _describe(sizes: dict[str, tuple[int, ...]]) -> str:
+    return ", ".join(f"{size} for location={where!r}" for where, size in sizes.items())
+
+
+def choose_location(
+    shape: tuple[int, ...], sizes: dict[str, tuple[int, ...]], location: str | None
+) -> str:
+    """`location` where its shape fits, else the only one that fits, or a ValueError."""
+    check_location(location)
+    fits = infer_location(shape, sizes)
+    if location is not None:
+        if location in fits:
+            return location
+        if location not in sizes:
+            raise ValueError(f"location={location!r} needs a mesh of tetra cells only.")
+        raise ValueError(
+            f"values must have shape {sizes[location]} for location={location!r}, but has {shape}."
+        )
+    if len(fits) == 1:
+        return fits[0]
+    if len(fits) > 1:
+        raise ValueError(
+            f"values of shape {shape} may be any of {', '.join(fits)} data. Say which with "
+            "location=..."
+        )
+    if len(shape) == 2 and shape[0] in (sizes["point"][0], sizes["cell"][0]):
+        raise ValueError(
+            f"values must be one number each, but has shape {shape}: a field of {shape[1]} "
+            "components. Pass one component, or the magnitude."
+        )
+    raise ValueError(f"values must have shape {_describe(sizes)}, but has {shape}.")
+
+
+def place(values: Any, built: Built, location: str | None) -> tuple[np.ndarray, str]:
+    """Values given for points or input cells, as those of the built mesh, and their location."""
+    check_location(location)
+    dtype = built.points.dtype
+    if isinstance(values, Mapping):
+        if location == "point":
+            raise ValueError("values as a dict by cell type cannot have location='point'.")
+        values = _join(values, built, dtype)
+        sizes: dict[str, tuple[int, ...]] = {"cell": (built.n_input,)}
+    else:
+        values = floats("values", values, dtype)
+        if values.ndim == 2 and values.shape[1] == 1:
+            values = values[:, 0]
+        sizes = {"point": (len(built.points),), "cell": (built.n_input,)}
+    if built.all_tetra:
+        sizes["corner"] = (built.n_input, 4)
+        if location is None and values.shape == (len(built.points), 4) == sizes["corner"]:
+            raise ValueError(
+                f"values of shape {values.shape} may be corner data or a point field of four "
+                'components. Say location="corner" if they are corner data.'
+            )
+    where = choose_location(values.shape, sizes, location)
+    if where == "point":
+        return values, where
+    values = values[built.parent]
+    if where == "corner":
+        values = np.take_along_axis(values, built.order.astype(np.intp), 1)
+    return values, where
+
+
+def _join(values: Mapping[Any, Any], built: Built, dtype: np.dtype) -> np.ndarray:
+    """A dict from cell type to values as one array in the order of the blocks."""
+    given = {str(k): v for k, v in values.items()}
+    parts = []
+    for name, n in built.block_sizes:
+        if name not in given:
+            if n == 0:
+                continue
+            raise ValueError(f"values has no entry for {name!r}; it has {sorted(given)}.")
+        part = floats(f"values[{name!r}]", given[name], dtype)
+        if part.ndim == 2 and part.shape[1] == 1:
+            part = part[:, 0]
+        if len(part) != n or part.ndim == 0:
+            raise ValueError(f"values[{name!r}] has shape {part.shape} for {n} cells.")
+        if n:
+            parts.append(part)
+    known = {name for name, _ in built.block_sizes} | {t for t, _ in built.report.ignored}
+    extra = sorted(set(given) - known)
+    if extra:
+        raise ValueError(f"values has entries for {extra}, but the mesh has no such cells.")
+    if len({p.shape[1:] for p in parts}) > 1:
+        raise ValueError(f"values differ in shape: {[p.shape for p in parts]}.")
+    return np.concatenate(parts)

@@ -1,0 +1,36 @@
+"""A strict session: warnings are errors, no silent rank promotion, both precisions."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+DATA = Path(
+    os.environ.get("JAXVR_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
+)
+
+
+@pytest.fixture(scope="session")
+def data_path():
+    """Path of a file of the real test data; the test fails, loudly, where it is missing."""
+
+    def find(name: str) -> Path:
+        path = DATA / name
+        if not path.exists():
+            pytest.fail(f"{name} is missing: set JAXVR_DATA to the folder of the test data.")
+        return path
+
+    return find
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    return request.param
