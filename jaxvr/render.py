@@ -31,7 +31,7 @@ from jaxvr.view.camera import Camera
 Array = jax.Array
 
 # Rays in one batch: enough to hide the cost of starting a kernel, few enough to stay in cache.
-BATCH = 4096
+BATCH = 512
 
 
 def render(
@@ -262,11 +262,13 @@ def _batches(arrays: Any) -> tuple[Any, int]:
     return tuple(split(x) for x in arrays), count
 
 
-def _tiles(height: int, width: int, side: int = 16) -> np.ndarray:
-    """Pixel numbers, tile by tile: neighbours in the list are neighbours in the image."""
-    rows, columns = np.mgrid[0:height, 0:width]
-    key = (rows // side, columns // side, rows, columns)
-    return np.lexsort([k.ravel() for k in reversed(key)]).astype(np.int32)
+def _tiles(height: int, width: int) -> np.ndarray:
+    """Pixel numbers along a Morton curve: neighbours in the list are neighbours in the image."""
+    rows, columns = (x.ravel() for x in np.mgrid[0:height, 0:width])
+    key = np.zeros(rows.size, np.int64)
+    for bit in range(max(height, width).bit_length()):
+        key |= ((rows >> bit & 1) << (2 * bit + 1)) | ((columns >> bit & 1) << (2 * bit))
+    return np.argsort(key, kind="stable").astype(np.int32)
 
 
 def _untile(x: Array, order: np.ndarray) -> Array:

@@ -17,7 +17,7 @@ boundary's shape. Holes, several components and cracks need no care.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,12 +36,18 @@ BATCH = 12  # candidates collected before they are tested
 
 
 class Entries(NamedTuple):
-    """The next entries of each ray: depth (PEEL, R), inf where there is none; face (PEEL, R),
-    packed words; more (R,): whether there are others behind them."""
+    """The next entries of each ray: PEEL depths (R,), inf where there is none, and PEEL faces
+    (R,), packed words or -1; more (R,): whether there are others behind them."""
 
-    depth: Array
-    face: Array
+    depth: tuple[Array, ...]
+    face: tuple[Array, ...]
     more: Array
+
+
+def no_entries(count: int, dtype: Any, more: bool = False) -> Entries:
+    """Of `count` rays, with more to come or not."""
+    depth, face = jnp.full(count, jnp.inf, dtype), jnp.full(count, -1, jnp.int32)
+    return Entries((depth,) * PEEL, (face,) * PEEL, jnp.full(count, more))
 
 
 class Boxes(NamedTuple):
@@ -177,7 +183,7 @@ def search(
                 jnp.where(before, faces[k], face),
                 jnp.where(before, faces[k] >= 0, valid),
             )
-        return Entries(jnp.stack(new_depths), jnp.stack(new_faces), more | valid)
+        return Entries(tuple(new_depths), tuple(new_faces), more | valid)
 
     def round_(carry):
         node, entries = carry
@@ -190,15 +196,14 @@ def search(
             word = jnp.maximum(word, 0)
             contained, depth = _test(scene, rays, word, valid)
             behind = (depth > last_depth) | ((depth == last_depth) & (word > last_face))
-            return insert(entries, depth, word, valid & contained & behind)
+            valid = valid & contained & behind
+            return lax.cond(
+                jnp.any(valid), insert, lambda e, *_: e, entries, depth, word, valid
+            )
 
         return node, lax.fori_loop(0, jnp.max(found), one, entries)
 
-    entries = Entries(
-        jnp.full((PEEL, count), jnp.inf, dtype),
-        jnp.full((PEEL, count), -1, jnp.int32),
-        jnp.zeros(count, bool),
-    )
+    entries = no_entries(count, dtype)
     _, entries = lax.while_loop(
         lambda carry: jnp.any(carry[0] > 0),
         round_,

@@ -36,7 +36,7 @@ from jaxvr._core.pytree import pytree
 from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment
 from jaxvr.trace.base import AbstractTracer
-from jaxvr.trace.entry import PEEL, Boxes, Entries, build_boxes, search
+from jaxvr.trace.entry import Boxes, Entries, build_boxes, no_entries, search
 from jaxvr.trace.face import Face, choose, crossing, is_positive, opposite_edges
 from jaxvr.trace.local import edges_to_apex, exit_face, leave_by, make_segment, pull_back_cell
 from jaxvr.trace.scene import (
@@ -138,9 +138,7 @@ class RayCast(AbstractTracer):
             waiting=~no,
             fresh=no,
             status=integer,
-            entries=Entries(
-                jnp.full((PEEL, count), jnp.inf, dtype), jnp.full((PEEL, count), -1), ~no
-            ),
+            entries=no_entries(count, dtype, more=True),
             last=(zero - jnp.inf, integer - 1),
         )
 
@@ -240,11 +238,12 @@ def _enter(scene: CastScene, rays: ShearedRays, state: CastState, arrival: _Arri
         jnp.where(entering, word, state.last[1]),
     )
 
-    def shift(stack, filler):
-        moved = jnp.concatenate([stack[1:], jnp.full_like(stack[:1], filler)])
-        return jnp.where(entering[None], moved, stack)
-
-    entries = Entries(shift(entries.depth, jnp.inf), shift(entries.face, -1), entries.more)
+    rest = Entries(
+        (*entries.depth[1:], jnp.full_like(entries.depth[0], jnp.inf)),
+        (*entries.face[1:], jnp.full_like(entries.face[0], -1)),
+        entries.more,
+    )
+    entries = choose(entering, rest, entries)
     word = jnp.maximum(word, 0)
     cell, corner = packing.cell_of(word), packing.corner_of(word)
     wanted = jnp.any(entering)
