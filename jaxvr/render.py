@@ -146,16 +146,17 @@ def trace(
         shape, order = origins.shape[:-1], np.arange(origins.size // 3)
         origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     counts, status = _count(tracer, volume, origins, directions)
-    counts = np.asarray(counts)
     check(status)
+    # Rays of like length together: then no ray of a batch waits for the others when shaded.
+    by_length = np.argsort(np.asarray(counts), kind="stable")
+    counts, status, order = np.asarray(counts)[by_length], status[by_length], order[by_length]
+    origins, directions = origins[by_length], directions[by_length]
     start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     if start[-1] >= 2**31:
         raise ValueError(f"{start[-1]} nodes do not fit 32-bit indices. Trace fewer rays at once.")
     # Buffers are as long as the next multiple, so that similar views share a compiled function.
     total = -(-max(int(start[-1]), 1) // (1 << 16)) << 16
-    nodes, segments = _fill(
-        tracer, volume, origins, directions, start[:-1].astype(np.int32), total
-    )
+    nodes, segments = _fill(tracer, volume, origins, directions, start[:-1].astype(np.int32), total)
     return Segments(
         nodes.scalar,
         nodes.length,

@@ -6,9 +6,9 @@ points, integrated by Gauss-Legendre quadrature and composited.
 
 Geometry is in `np.longdouble` (64 bits of mantissa where the hardware has them), so that the error
 of the reference itself is far below that of what it is compared with. A ray that lies in a face
-belongs to the cell on one side of it: every ray is moved sideways by `SHIFT` of the mesh's diagonal
-(some 1e-16) in a direction that has nothing to do with the mesh, which is above the rounding of the
-half-spaces and below everything else. Where the field is continuous that is no change; a ray that
+belongs to the cell on one side of it: every ray is moved sideways by 1024 epsilons (some 1e-16) of
+the mesh's diagonal, in a direction that has nothing to do with the mesh, which is above the rounding
+of the half-spaces and below everything else. Where the field is continuous that is no change; a ray that
 lies in the *boundary*, or between cells with different values, has no value of its own, and
 `Reference.ambiguous` finds it.
 
@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Exact = np.longdouble
-SHIFT = 1024 * float(np.finfo(Exact).eps)
 SIDEWAYS = np.array([0.5641895835477563, 0.7316738548391265, 0.3819660112501051])
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 # 20 points are good to 1e-15 up to this optical depth; thicker slabs are cut into equal parts.
@@ -44,9 +43,14 @@ class Pieces(NamedTuple):
 
 
 class Reference:
-    """A mesh prepared for brute force. `mesh` has points (P, 3), cells (T, 4), values."""
+    """A mesh prepared for brute force. `mesh` has points (P, 3), cells (T, 4), values.
 
-    def __init__(self, mesh: Any):
+    exact: the dtype of the geometry; float64 is three times as fast, and good for lengths.
+    """
+
+    def __init__(self, mesh: Any, exact: Any = Exact):
+        self.exact = exact
+        self.shift = 1024 * float(np.finfo(exact).eps)
         points = np.asarray(mesh.points, np.float64)
         self.cells = np.asarray(mesh.cells)
         self.corners = points[self.cells]
@@ -58,7 +62,7 @@ class Reference:
         }[mesh.location]()
         self.low, self.high = self.corners.min((0, 1)), self.corners.max((0, 1))
         self.diagonal = float(np.linalg.norm(self.high - self.low))
-        exact = self.corners.astype(Exact)
+        exact = self.corners.astype(self.exact)
         self.anchor = np.stack([exact[:, f[0]] for f in FACES], 1)
         normal = np.stack(
             [np.cross(exact[:, b] - exact[:, a], exact[:, c] - exact[:, a]) for a, b, c in FACES],
@@ -115,16 +119,18 @@ class Reference:
                 ray, node = ray[there], node[there]
         return ray, self.order[node]
 
-    def pieces(self, origins: Any, directions: Any, shift: Any = SHIFT) -> Pieces:
+    def pieces(self, origins: Any, directions: Any, shift: float | None = None) -> Pieces:
         """Chords of rays (R, 3); depths are world lengths from the origin."""
         origins = np.asarray(origins, np.float64)
         directions = np.asarray(directions, np.float64)
         ray, cell = self.candidates(origins, directions)
-        o = origins.astype(Exact) + Exact(self.diagonal) * Exact(shift) * SIDEWAYS.astype(Exact)
-        d = directions.astype(Exact)
+        exact = self.exact
+        shift = self.shift if shift is None else shift
+        o = origins.astype(exact) + (exact(self.diagonal) * exact(shift)) * SIDEWAYS.astype(exact)
+        d = directions.astype(exact)
         d = d / np.sqrt((d * d).sum(-1, keepdims=True))
-        rise = np.zeros((len(ray), 4), Exact)
-        start = np.zeros((len(ray), 4), Exact)
+        rise = np.zeros((len(ray), 4), exact)
+        start = np.zeros((len(ray), 4), exact)
         for axis in range(3):
             n = self.normal[cell, :, axis]
             rise += n * d[ray, axis][:, None]
@@ -157,15 +163,17 @@ class Reference:
         kept = (ray, cell, first, last, front, back)
         return Pieces(*(x[order] for x in kept))
 
-    def trace(self, origins: Any, directions: Any, chunk: int = 256):
-        """Pieces of many rays, some at a time: yields (slice, pieces)."""
-        origins, directions = np.asarray(origins), np.asarray(directions)
-        for i in range(0, len(origins), chunk):
-            part = slice(i, min(i + chunk, len(origins)))
-            yield part, self.pieces(origins[part], directions[part])
+    def lengths(
+        self, origins: Any, directions: Any, chunk: int = 64, shift: float | None = None
+    ) -> np.ndarray:
+        """The total chord (R,) of rays (R, 3)."""
+        parts = [slice(i, i + chunk) for i in range(0, len(origins), chunk)]
+        traced = (self.pieces(origins[p], directions[p], shift) for p in parts)
+        sums = [chords(t, len(origins[p])) for t, p in zip(traced, parts, strict=True)]
+        return np.concatenate([np.zeros(0), *sums])
 
     def render(
-        self, origins: Any, directions: Any, transfer: Any, chunk: int = 256, shift: Any = SHIFT
+        self, origins: Any, directions: Any, transfer: Any, chunk: int = 64, shift: float | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """rgba (R, 4), premultiplied, and the total chord (R,) of rays (R, 3)."""
         table = tuple(

@@ -44,4 +44,6 @@ def check(status: Any) -> None:
         hit = (bits & bit) != 0
         if hit.any():
             first = tuple(int(i) for i in np.argwhere(hit)[0])
-            raise RenderError(f"{int(hit.sum())} ray(s) {what}, the first at index {first}. {advice}")
+            raise RenderError(
+                f"{int(hit.sum())} ray(s) {what}, the first at index {first}. {advice}"
+            )

@@ -68,16 +68,17 @@ def busy(march: March) -> Array:
 
 
 def shade_piece(pipeline: Pipeline, operands: Operands, march: March):
-    """Composites the current pieces: the pixel behind them, the cursor, what is finished."""
+    """Composites the current pieces: the pixel behind them, the cursor, what is finished, and
+    the pieces."""
     with jax.named_scope("shade"):
-        rgb, depth, cursor, finished = pipeline.integrator.step(
+        rgb, depth, cursor, finished, piece = pipeline.integrator.step(
             operands.table, march.trace.segment, march.cursor
         )
         live = march.trace.active
         pixel = pipeline.compositor.add(
             march.pixel, jnp.where(live[None], rgb, 0), jnp.where(live, depth, 0)
         )
-    return pixel, cursor, finished
+    return pixel, cursor, finished, piece
 
 
 def advance(
@@ -97,16 +98,14 @@ def advance(
 
 
 def iterate(pipeline: Pipeline, operands: Operands, march: March) -> March:
-    pixel, cursor, finished = shade_piece(pipeline, operands, march)
+    pixel, cursor, finished, _ = shade_piece(pipeline, operands, march)
     trace, cursor = advance(pipeline, operands, march, cursor, finished)
     return March(trace, cursor, pixel)
 
 
 def march_while(pipeline: Pipeline, operands: Operands) -> March:
     """One batch, by a while loop: as many iterations as its longest ray needs."""
-    return lax.while_loop(
-        busy, lambda m: iterate(pipeline, operands, m), begin(pipeline, operands)
-    )
+    return lax.while_loop(busy, lambda m: iterate(pipeline, operands, m), begin(pipeline, operands))
 
 
 def finish(pipeline: Pipeline, march: March) -> tuple[Array, Array]:

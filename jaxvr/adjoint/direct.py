@@ -32,7 +32,9 @@ class Direct(AbstractAdjoint):
         def one(batch):
             def body(march, _):
                 done = jax.tree.map(lax.stop_gradient, busy(march))
-                return lax.cond(done, lambda m: iterate(pipeline, batch, m), lambda m: m, march), None
+                return lax.cond(
+                    done, lambda m: iterate(pipeline, batch, m), lambda m: m, march
+                ), None
 
             march, _ = lax.scan(body, begin(pipeline, batch), length=self.max_steps)
             rgba, bits = finish(pipeline, march)

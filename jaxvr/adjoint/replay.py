@@ -86,7 +86,8 @@ def _backward(pipeline: Pipeline, residuals: Any, cotangents: Any):
     operands, finals, asked = residuals
     rgba_bar, _ = cotangents
     if isinstance(rgba_bar, jax.custom_derivatives.SymbolicZero):
-        rgba_bar = jnp.zeros(rgba_bar.aval.shape, rgba_bar.aval.dtype)
+        aval: Any = rgba_bar.aval
+        rgba_bar = jnp.zeros(aval.shape, aval.dtype)
     tracer, integrator, compositor = pipeline.tracer, pipeline.integrator, pipeline.compositor
     structure = jax.tree.structure(operands)
     perturbed: Operands = jax.tree.unflatten(structure, asked.leaves)
@@ -101,12 +102,12 @@ def _backward(pipeline: Pipeline, residuals: Any, cotangents: Any):
 
         def body(loop):
             march, table_bar, trace_bar = loop
-            pixel, cursor, finished = shade_piece(pipeline, one, march)
+            pixel, cursor, finished, piece = shade_piece(pipeline, one, march)
             live = march.trace.active
             rgb_bar, depth_bar = compositor.pull_back(march.pixel, pixel, final, pixel_bar)
             piece_bar = jnp.where(live[None], rgb_bar, 0), jnp.where(live, depth_bar, 0)
             segment_bar, table_bar = integrator.pull_back(
-                one.table, march.trace.segment, march.cursor, piece_bar, table_bar
+                one.table, march.trace.segment, piece, piece_bar, table_bar
             )
             if geometric:
                 trace_bar = tracer.pull_back(one.scene, rays, march.trace, segment_bar, trace_bar)

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 
 from jaxvr.numerics import compensated
 from jaxvr.numerics.compensated import Sum
+from jaxvr.numerics.moments import opacity
 
 Array = jax.Array
 
@@ -51,7 +52,7 @@ class Over:
 
     def finish(self, state: OverState) -> Array:
         """Premultiplied RGBA (4, R)."""
-        alpha = -jnp.expm1(-compensated.value(state.depth))
+        alpha = opacity(compensated.value(state.depth))
         return jnp.concatenate([compensated.value(state.rgb), alpha[None]])
 
     def pull_back(

@@ -121,6 +121,21 @@ def transmittance(a: Array, b: Array) -> Array:
     return jnp.exp(-0.5 * total) * (1 - 0.5 * lost)
 
 
+@jax.custom_jvp
+def opacity(depth: Array) -> Array:
+    """1 - exp(-depth), for thin and thick media alike.
+
+    Its derivative is exp(-depth). JAX would take that of expm1 as expm1 + 1, which has no digits
+    left at depth 16 in float32.
+    """
+    return -jnp.expm1(-depth)
+
+
+@opacity.defjvp
+def _opacity_jvp(primals, tangents):
+    return opacity(*primals), jnp.exp(-primals[0]) * tangents[0]
+
+
 def _weights(a: Array, b: Array, moments: tuple[Array, ...]) -> tuple[Array, Array]:
     b0, b1, b2 = moments
     half = 0.5 * b1

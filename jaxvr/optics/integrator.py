@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxvr._core.stage import stage
+from jaxvr.numerics.moments import opacity
 from jaxvr.optics.partition import (
     Cursor,
     Ends,
@@ -61,8 +62,9 @@ class AbstractIntegrator(abc.ABC):
     @abc.abstractmethod
     def step(
         self, table: Any, segment: Segment, cursor: Cursor
-    ) -> tuple[Array, Array, Cursor, Array]:
-        """Next piece: rgb (3, R), optical depth (R,), cursor behind it, segment finished (R,)."""
+    ) -> tuple[Array, Array, Cursor, Array, Any]:
+        """Next piece: rgb (3, R), optical depth (R,), cursor behind it, segment finished (R,), and
+        what `pull_back` wants to know of it."""
 
     @abc.abstractmethod
     def gradient_start(self, table: Any) -> Any:
@@ -73,13 +75,14 @@ class AbstractIntegrator(abc.ABC):
         self,
         table: Any,
         segment: Segment,
-        cursor: Cursor,
+        piece: Any,
         cotangent: tuple[Array, Array],
         gradient: Any,
     ) -> tuple[Segment, Any]:
-        """Cotangents of the segment at `cursor`, and `gradient` with the table's share added.
+        """Cotangents of the segment, and `gradient` with the table's share added.
 
         Args:
+          piece: from `step`.
           cotangent: of the piece's rgb (3, R) and optical depth (R,).
           gradient: as from `gradient_start`, or None if the table's gradient is not wanted.
         """
@@ -98,20 +101,20 @@ class AbstractSlabIntegrator(AbstractIntegrator):
 
     def slab(self, extinction_front, extinction_back, color_front, color_back, length):
         tau_f, tau_b = jnp.asarray(extinction_front), jnp.asarray(extinction_back)
-        c_f, c_b, l = jnp.asarray(color_front), jnp.asarray(color_back), jnp.asarray(length)
+        c_f, c_b, size = jnp.asarray(color_front), jnp.asarray(color_back), jnp.asarray(length)
         shape = jnp.broadcast_shapes(
-            tau_f.shape, tau_b.shape, c_f.shape[:-1], c_b.shape[:-1], l.shape
+            tau_f.shape, tau_b.shape, c_f.shape[:-1], c_b.shape[:-1], size.shape
         )
-        dtype = jnp.result_type(tau_f, tau_b, c_f, c_b, l, jnp.float32)
+        dtype = jnp.result_type(tau_f, tau_b, c_f, c_b, size, jnp.float32)
 
         def column(tau, color):
             tau = jnp.broadcast_to(tau, shape).reshape(1, -1)
             color = jnp.broadcast_to(color, (*shape, 3)).reshape(-1, 3).T
             return jnp.concatenate([tau, color]).astype(dtype)
 
-        l = jnp.broadcast_to(l, shape).reshape(-1).astype(dtype)
-        rgb, depth = self.slab_integral(Ends(column(tau_f, c_f), column(tau_b, c_b), l))
-        return rgb.T.reshape(*shape, 3), -jnp.expm1(-depth).reshape(shape)
+        size = jnp.broadcast_to(size, shape).reshape(-1).astype(dtype)
+        rgb, depth = self.slab_integral(Ends(column(tau_f, c_f), column(tau_b, c_b), size))
+        return rgb.T.reshape(*shape, 3), opacity(depth).reshape(shape)
 
     def prepare(self, transfer, dtype):
         return nodes_of(transfer, dtype)
@@ -124,22 +127,25 @@ class AbstractSlabIntegrator(AbstractIntegrator):
         piece, cursor, finished = stage(jnp.any(segment.length >= 0), cut, table, segment, cursor)
         slabs = stage(wanted, gather, table, piece)
         rgb, depth = stage(wanted, lambda *x: self.slab_integral(ends(*x)), piece, segment, slabs)
-        return rgb, depth, cursor, finished
+        return rgb, depth, cursor, finished, (piece, slabs)
 
     def gradient_start(self, table):
         # Row left + right holds both control points of a slab, (position, optical) twice: even
         # rows are the outermost slabs, whose control points coincide, row 2 k + 1 is slab k, k + 1.
         return jnp.zeros((2 * table.position.shape[0], 10), table.position.dtype)
 
-    def pull_back(self, table, segment, cursor, cotangent, gradient):
-        piece, _, _ = cut(table, segment, cursor)
-        slabs = gather(table, piece)
-        _, pull = jax.vjp(lambda s, t: self.slab_integral(ends(piece, s, t)), segment, slabs)
-        segment_bar, slabs_bar = pull(cotangent)
+    def pull_back(self, table, segment, piece, cotangent, gradient):
+        def pull(segment, piece, slabs, cotangent):
+            _, back = jax.vjp(lambda s, t: self.slab_integral(ends(piece, s, t)), segment, slabs)
+            return back(cotangent)
+
+        piece, slabs = piece
+        segment_bar, slabs_bar = stage(
+            jnp.any(segment.length > 0), pull, segment, piece, slabs, cotangent
+        )
         if gradient is not None:
             rows = jnp.concatenate([slabs_bar.position[:, None], slabs_bar.optical], 1)
-            rows = rows.reshape(10, -1).T
-            gradient = gradient.at[piece.left + piece.right].add(rows)
+            gradient = gradient.at[piece.left + piece.right].add(rows.reshape(10, -1).T)
         return segment_bar, gradient
 
     def gradient_finish(self, table, gradient):
@@ -149,4 +155,3 @@ class AbstractSlabIntegrator(AbstractIntegrator):
         nodes = jnp.zeros((count, 5), gradient.dtype)
         nodes = nodes.at[left].add(gradient[:, :5]).at[right].add(gradient[:, 5:])
         return Nodes(nodes[:, 0], nodes[:, 1:].T)
-

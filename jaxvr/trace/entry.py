@@ -197,9 +197,7 @@ def search(
             contained, depth = _test(scene, rays, word, valid)
             behind = (depth > last_depth) | ((depth == last_depth) & (word > last_face))
             valid = valid & contained & behind
-            return lax.cond(
-                jnp.any(valid), insert, lambda e, *_: e, entries, depth, word, valid
-            )
+            return lax.cond(jnp.any(valid), insert, lambda e, *_: e, entries, depth, word, valid)
 
         return node, lax.fori_loop(0, jnp.max(found), one, entries)
 

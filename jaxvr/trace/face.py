@@ -45,7 +45,7 @@ def _area(xi, yi, xj, yj, i_first):
 
 
 @_area.defjvp
-def _area_jvp(primals, tangents):
+def _area_jvp(primals, tangents) -> Any:
     xi, yi, xj, yj, _ = primals
     dxi, dyi, dxj, dyj, _ = tangents
     area, positive = _area(*primals)
@@ -112,9 +112,17 @@ def barycentric(face: Face, weights: Array) -> Array:
 
 
 def crossing(face: Face, weights: Array) -> Crossing:
-    """The point of the ray in a face. Differences are formed first, so that constants stay."""
+    """The point of the ray in a face, from weights >= 0 (3, R)."""
+    return crossing_at(face, barycentric(face, weights))
+
+
+def crossing_at(face: Face, coordinates: Array) -> Crossing:
+    """The point of a face with these barycentric coordinates (3, R).
+
+    Differences are formed first, so that constants stay constant.
+    """
     a, b, c = face
-    _, of_b, of_c = barycentric(face, weights)
+    _, of_b, of_c = coordinates
     z_step = of_b * ((b[Z] - a[Z]) + (b[Z_LOW] - a[Z_LOW]))
     z_step = z_step + of_c * ((c[Z] - a[Z]) + (c[Z_LOW] - a[Z_LOW]))
     z, lost = two_sum(a[Z], z_step)

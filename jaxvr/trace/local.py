@@ -1,30 +1,47 @@
 """The segment of one cell, and its derivative.
 
-Its derivative is with respect to the cell's four vertices, their scalars and the ray.
-
 A segment is two crossings of faces, of the entry face (a, b, c) and of the exit face, which has the
-apex d in place of one of them. Written here as one function of the four projected vertices, it is
-differentiated by JAX, and the cotangents go back through the projection by hand, since that is
-linear:
+apex d in place of one of them. Its derivative is with respect to the cell's four vertices, their
+scalars and the ray, and is local.
 
-    x = (p - o)_kx - S_x (p - o)_kz      y alike      z = sign (p - o)_kz
-    p_bar_kx = x_bar     p_bar_ky = y_bar     p_bar_kz = sign z_bar - S_x x_bar - S_y y_bar
-    o_bar = -sum p_bar   S_x_bar = -sum x_bar (p - o)_kz
+At the crossing of a face with barycentric coordinates l_i, any f that is linear on the face (depth
+z, scalar s) has the value f = sum l_i f_i, and the foot of the ray stays at the origin, so that
 
-and are scattered to where the vertices were gathered from.
+    df = sum_i l_i (df_i - f_x dx_i - f_y dy_i)
+
+with (f_x, f_y) the gradient of f over the projected face. Cotangents z_bar, s_bar of a crossing
+therefore reach vertex i as l_i q, with one q for the whole face:
+
+    q_x = -(z_bar z_x + s_bar s_x)    q_y = -(z_bar z_y + s_bar s_y)    q_z = z_bar    q_s = s_bar
+
+The projection is linear in the points (see `shear`), so with sums over both faces
+
+    p_bar_kx = q_x    p_bar_ky = q_y    p_bar_kz = sign q_z - S_x q_x - S_y q_y    (times l_i)
+    o_bar = -p_bar    S_x_bar = -sign q_x z    S_y_bar = -sign q_y z    (z at the crossing)
+
+since the l_i add up to one. Points and scalars get theirs scattered to where they came from.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment
-from jaxvr.trace.face import Face, choose, crossing, edge, is_positive, opposite_edges
+from jaxvr.trace.face import (
+    Crossing,
+    Face,
+    barycentric,
+    choose,
+    crossing_at,
+    edge,
+    is_positive,
+)
 from jaxvr.trace.scene import Scene, entry_corners, local_ids, value_slots
-from jaxvr.trace.shear import VALUE, ShearedRays, X, Y, Z
+from jaxvr.trace.shear import VALUE, Z_LOW, ShearedRays, X, Y, Z
 from jaxvr.volume import packing
 
 Array = jax.Array
@@ -97,59 +114,98 @@ def _clip_at_eye(start, end, front: Array, back: Array, chord: Array, stretch: A
     )
 
 
-def _segment(vertices, stretch, corner, drop, turned) -> Segment:
-    """The segment of a cell from its vertices (a, b, c, d), in the manner of the walk."""
-    face, apex = vertices[:3], vertices[3]
-    edges = opposite_edges(*face)
-    sizes = jnp.where(is_positive(edges), edges, -edges)
-    enter = crossing(face, sizes)
-    to_apex = edges_to_apex(face, apex, corner)
-    # The same exit as the walk's: `drop` is handed over, and the signs here only give sizes.
-    exit_weights = exit_sizes(sizes, jnp.where(is_positive(to_apex), to_apex, -to_apex), drop)
-    leave = crossing(exit_face(face, apex, drop), exit_weights)
-    depth = jnp.stack([enter.z, enter.z_low])
-    return make_segment(depth, enter.value, leave, turned, stretch)[0]
+class _Pulled(NamedTuple):
+    """q_x, q_y, q_z, q_s of a face, (R,) each."""
+
+    x: Array
+    y: Array
+    z: Array
+    s: Array
 
 
-def pull_back_cell(scene: Scene, rays: ShearedRays, state, cotangent: Segment, gradient):
+def _pull_back_crossing(face: Face, area: Array, z_bar: Array, s_bar: Array) -> _Pulled:
+    """`area` (R,) is twice the face's signed area; where it is zero, the ray lies in the face's
+    plane, and by convention the crossing does not move across it."""
+    a, b, c = face
+    u_x, u_y, v_x, v_y = b[X] - a[X], b[Y] - a[Y], c[X] - a[X], c[Y] - a[Y]
+    per_area = jnp.where(area == 0, 0, 1 / jnp.where(area == 0, 1, area))
+
+    def along(row: int, low: int | None = None) -> tuple[Array, Array]:
+        to_b, to_c = b[row] - a[row], c[row] - a[row]
+        if low is not None:
+            to_b, to_c = to_b + (b[low] - a[low]), to_c + (c[low] - a[low])
+        return (to_b * v_y - to_c * u_y) * per_area, (u_x * to_c - v_x * to_b) * per_area
+
+    (z_x, z_y), (s_x, s_y) = along(Z, Z_LOW), along(VALUE)
+    return _Pulled(-(z_bar * z_x + s_bar * s_x), -(z_bar * z_y + s_bar * s_y), z_bar, s_bar)
+
+
+def _crossed(face: Face, weights: Array) -> tuple[Array, Crossing]:
+    coordinates = barycentric(face, weights)
+    return coordinates, crossing_at(face, coordinates)
+
+
+def pull_back_cell(
+    scene: Scene, rays: ShearedRays, state: Any, cotangent: Segment, gradient: Any
+) -> Any:
     """See `AbstractTracer.pull_back`; `gradient` is ((values, coordinates), rays), or Nones."""
     (values, coordinates), by_rays = gradient
     cell = state.cell
+    live, wanted = state.active, jnp.any(state.active)
     number, corner = packing.cell_of(cell.word), packing.corner_of(cell.word)
     turned = packing.turned_of(cell.word) == 1
-    vertices = (*cell.face, cell.apex)
-    _, pull = jax.vjp(
-        lambda v, s: _segment(v, s, corner, cell.drop, turned), vertices, rays.stretch
-    )
-    live = state.active
-    cotangent = Segment(*(jnp.where(live, g, 0) for g in cotangent))
-    bars, stretch_bar = pull(cotangent)
-    corners = (*entry_corners(corner), corner)
-    ids = [local_ids(scene, number, k) for k in corners]
-    if values is not None:
-        slots = [
-            value_slots(scene, number, k, point) for k, point in zip(corners, ids, strict=True)
-        ]
-        values = values.at[jnp.concatenate(slots)].add(
-            jnp.concatenate([bar[VALUE] for bar in bars])
-        )
-    if coordinates is None and by_rays is None:
-        return (values, coordinates), by_rays
+    face, leaving = cell.face, exit_face(cell.face, cell.apex, cell.drop)
+    share, enter = stage(wanted, _crossed, face, cell.weights)
+    exit_share, leave = stage(wanted, _crossed, leaving, cell.exit_weights)
 
-    p_bars = []
-    for bar in bars:
-        z = rays.sign * bar[Z] - rays.shear_x * bar[X] - rays.shear_y * bar[Y]
-        p_bars.append((bar[X], bar[Y], z))
+    def pull_back_segment(enter: Crossing, leave: Crossing, stretch: Array, bar: Segment):
+        def forward(enter, leave, stretch):
+            depth = jnp.stack([enter.z, enter.z_low])
+            return make_segment(depth, enter.value, leave, turned, stretch)[0]
+
+        return jax.vjp(forward, enter, leave, stretch)[1](bar)
+
+    cotangent = Segment(*(jnp.where(live, g, 0) for g in cotangent))
+    enter_bar, leave_bar, stretch_bar = stage(
+        wanted, pull_back_segment, enter, leave, rays.stretch, cotangent
+    )
+    # The face (first, second, apex) is positive like the entry face, but for the dropped middle.
+    flip = cell.positive ^ (cell.drop == 1)
+    area, exit_area = jnp.sum(cell.weights, 0), jnp.sum(cell.exit_weights, 0)
+    area, exit_area = jnp.where(cell.positive, area, -area), jnp.where(flip, exit_area, -exit_area)
+    q = stage(wanted, _pull_back_crossing, face, area, enter_bar.z, enter_bar.value)
+    p = stage(wanted, _pull_back_crossing, leaving, exit_area, leave_bar.z, leave_bar.value)
+
+    # Shares of a, b, c and d in both crossings.
+    none = jnp.zeros_like(share[0])
+    first, second, apex = exit_share
+    exit_share = (
+        jnp.where(cell.drop == 0, none, first),
+        jnp.where(cell.drop == 0, first, jnp.where(cell.drop == 2, second, none)),
+        jnp.where(cell.drop == 2, none, second),
+        apex,
+    )
+    shares = list(zip((*share, none), exit_share, strict=True))
+    corners = (*entry_corners(corner), corner)
+    ids = stage(wanted, lambda: tuple(local_ids(scene, number, k) for k in corners))
+    if values is not None:
+        slots = [value_slots(scene, number, *at) for at in zip(corners, ids, strict=True)]
+        bars = [i * q.s + o * p.s for i, o in shares]
+        values = values.at[jnp.concatenate(slots)].add(jnp.concatenate(bars))
+
+    def in_space(v: _Pulled) -> tuple[Array, Array, Array]:
+        return v.x, v.y, rays.sign * v.z - rays.shear_x * v.x - rays.shear_y * v.y
+
     if coordinates is not None:
         count = coordinates.shape[0] // 3
         axes = (rays.axis_x, rays.axis_y, rays.axis_z)
         where = [axis * count + point for point in ids for axis in axes]
-        what = [component for p_bar in p_bars for component in p_bar]
-        coordinates = coordinates.at[jnp.concatenate(where)].add(jnp.concatenate(what))
+        bars = [i * g + o * h for i, o in shares for g, h in zip(in_space(q), in_space(p))]
+        coordinates = coordinates.at[jnp.concatenate(where)].add(jnp.concatenate(bars))
     if by_rays is not None:
-        o_x, o_y, o_z = (sum(p[k] for p in p_bars) for k in range(3))
-        s_x = sum(bar[X] * v[Z] for bar, v in zip(bars, vertices, strict=True)) * rays.sign
-        s_y = sum(bar[Y] * v[Z] for bar, v in zip(bars, vertices, strict=True)) * rays.sign
-        change = (-o_x, -o_y, -o_z, -s_x, -s_y, stretch_bar)
+        origin = tuple(-(g + h) for g, h in zip(in_space(q), in_space(p), strict=True))
+        shear_x = -rays.sign * (q.x * enter.z + p.x * leave.z)
+        shear_y = -rays.sign * (q.y * enter.z + p.y * leave.z)
+        change = (*origin, shear_x, shear_y, stretch_bar)
         by_rays = tuple(g + c for g, c in zip(by_rays, change, strict=True))
     return (values, coordinates), by_rays

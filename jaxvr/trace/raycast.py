@@ -190,7 +190,13 @@ class RayCast(AbstractTracer):
             return zero
         o_x, o_y, o_z, s_x, s_y, stretch = gradient
         return dataclasses.replace(
-            zero, origin_x=o_x, origin_y=o_y, origin_z=o_z, shear_x=s_x, shear_y=s_y, stretch=stretch
+            zero,
+            origin_x=o_x,
+            origin_y=o_y,
+            origin_z=o_z,
+            shear_x=s_x,
+            shear_y=s_y,
+            stretch=stretch,
         )
 
 
@@ -226,9 +232,7 @@ def _enter(scene: CastScene, rays: ShearedRays, state: CastState, arrival: _Arri
     exhausted = state.waiting & (state.entries.face[0] < 0) & state.entries.more
 
     def again(entries):
-        return choose(
-            exhausted, search(mesh, rays, scene.boxes, exhausted, state.last), entries
-        )
+        return choose(exhausted, search(mesh, rays, scene.boxes, exhausted, state.last), entries)
 
     entries = lax.cond(jnp.any(exhausted), again, lambda e: e, state.entries)
     word = entries.face[0]
@@ -247,7 +251,8 @@ def _enter(scene: CastScene, rays: ShearedRays, state: CastState, arrival: _Arri
     word = jnp.maximum(word, 0)
     cell, corner = packing.cell_of(word), packing.corner_of(word)
     wanted = jnp.any(entering)
-    face = tuple(fetch(mesh, rays, cell, k, wanted) for k in entry_corners(corner))
+    a, b, c = (fetch(mesh, rays, cell, k, wanted) for k in entry_corners(corner))
+    face = (a, b, c)
     edges = stage(wanted, opposite_edges, *face)
     sizes = jnp.where(is_positive(edges), edges, -edges)
     at = stage(wanted, crossing, face, sizes)
@@ -285,9 +290,7 @@ def _arrive(
     turned = packing.turned_of(word) == 1
     segment, depth = stage(wanted, make_segment, arrival.depth, front, out, turned, rays.stretch)
     lost = moved & leave.lost
-    cell = Cell(
-        word, arrival.positive, face, arrival.weights, apex, leave.drop, leave.weights
-    )
+    cell = Cell(word, arrival.positive, face, arrival.weights, apex, leave.drop, leave.weights)
     active = jnp.where(moved, ~lost, state.active)
     segment = choose(moved, segment, state.segment)
     return CastState(
@@ -325,7 +328,5 @@ def _values_here(scene: Scene, arrival: _Arrival, number, corner, word, moved):
         new, front = own(face, arrival.weights)
         return choose(seam, new, face), jnp.where(seam, front, value)
 
-    face, front = lax.cond(
-        jnp.any(seam), reload, lambda *same: same, arrival.face, arrival.value
-    )
+    face, front = lax.cond(jnp.any(seam), reload, lambda *same: same, arrival.face, arrival.value)
     return face, front, seam

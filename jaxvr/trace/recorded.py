@@ -48,8 +48,10 @@ class Segments:
 
 
 class Nodes(NamedTuple):
-    scalar: Array
-    length: Array
+    """scalar, length (N,); in a gradient, None for what is not asked for."""
+
+    scalar: Any
+    length: Any
 
 
 class Runs(NamedTuple):
@@ -170,7 +172,8 @@ def fill(tracer: AbstractTracer, scene: Any, rays: Any, start: Array, total: int
         loop = (tracer.start(scene, batch), place, nodes)
         return lax.while_loop(_going, body, loop)[2], None
 
-    dtype = jax.tree.leaves(tracer.start(scene, jax.tree.map(lambda x: x[0], rays)).segment)[0].dtype
+    first = tracer.start(scene, jax.tree.map(lambda x: x[0], rays))
+    dtype = first.segment.length.dtype
     nodes = (jnp.zeros(total, dtype), jnp.zeros(total, dtype))
     return Nodes(*lax.scan(one, nodes, (rays, start))[0])
 

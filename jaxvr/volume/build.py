@@ -44,7 +44,8 @@ def mesh_dtype(points: Any, dtype: Any) -> np.dtype:
                 given = np.asarray(points).dtype
             except Exception:
                 return default_float()
-        return float_dtype(given) if np.dtype(given).kind == "f" else default_float()
+        given = np.dtype(given).newbyteorder("=")  # files may have the other byte order
+        return float_dtype(given) if given.kind == "f" else default_float()
     try:
         want = np.dtype(dtype)
     except TypeError as e:

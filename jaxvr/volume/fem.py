@@ -56,7 +56,9 @@ def _assemble(local: np.ndarray, simplices: np.ndarray, n: int) -> csr_array:
 def solve(matrix: csr_array, right: np.ndarray, rtol: float = 1e-11) -> np.ndarray:
     """The solution of a symmetric positive definite system, by Jacobi-preconditioned CG."""
     n = len(right)
-    inverse = dia_array((np.reciprocal(matrix.diagonal().astype(np.float64))[None], [0]), shape=(n, n))
+    inverse = dia_array(
+        (np.reciprocal(matrix.diagonal().astype(np.float64))[None], [0]), shape=(n, n)
+    )
     x, failed = cg(matrix, right, rtol=rtol, maxiter=20 * n + 100, M=inverse)
     if failed:
         raise RuntimeError(f"Conjugate gradients did not converge (code {failed}).")

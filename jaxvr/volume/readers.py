@@ -1,8 +1,9 @@
 """Files of unstructured meshes, through meshio: VTU, VTK, Exodus, gmsh, XDMF, Abaqus and others.
 
 meshio's readers end in many ways when a file is not what it seems (their own exceptions, those of
-zlib, struct and the XML parser, even `sys.exit` and a message on the console); all of them become
-one ValueError here. `read_mesh` never guesses: a vector field has to be asked for by component.
+zlib, struct and the XML parser, `sys.exit` and a message on the console, or not at all: see
+`endguard`); all of them become one ValueError here. `read_mesh` never guesses: a vector field has
+to be asked for by component.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import meshio
 import numpy as np
 
 from . import cells as zoo
+from .endguard import ending
 from .geometry import signed_volumes
 from .mesh import TetMesh, _from_cells
 
@@ -61,7 +63,7 @@ def _load(path: Path) -> meshio.Mesh:
         raise ValueError(f"{str(path)!r} is empty.")
     said = io.StringIO()
     try:
-        with _quiet(), contextlib.redirect_stderr(said):
+        with ending(), _quiet(), contextlib.redirect_stderr(said):
             mesh = meshio.read(path)
         points = np.asarray(mesh.points)
         blocks = [np.asarray(b.data) for b in mesh.cells]

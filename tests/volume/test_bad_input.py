@@ -1,4 +1,4 @@
-"""`from_cells` on arrays that went wrong at random: a clear error or a sound mesh, never a crash."""
+"""`from_cells` on arrays that went wrong at random: an error or a sound mesh, never a crash."""
 
 import warnings
 

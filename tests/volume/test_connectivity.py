@@ -141,7 +141,10 @@ def test_components_count():
     cells = np.asarray(mesh.cells)
     with pytest.warns(UserWarning):
         pair = TetMesh.from_cells(
-            two, {"tetra": np.concatenate([cells, cells + len(points)])}, two[:, 0], location="point"
+            two,
+            {"tetra": np.concatenate([cells, cells + len(points)])},
+            two[:, 0],
+            location="point",
         )
     assert "2, the largest of 12 tetrahedra" in pair.describe()
 

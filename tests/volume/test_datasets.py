@@ -10,6 +10,7 @@ from jaxvr.volume.connectivity import FACES
 from jaxvr.volume.describe import count_components
 from jaxvr.volume.flow import potential_flow
 from jaxvr.volume.quality import quality
+from jaxvr.volume.weld import weld
 
 
 def boundary_faces(mesh):
@@ -20,7 +21,7 @@ def boundary_faces(mesh):
 
 def euler(mesh):
     """V - E + F of the boundary surface: 2 for each sphere, 0 for each torus."""
-    faces = boundary_faces(mesh)
+    faces = weld(np.asarray(mesh.points))[0][boundary_faces(mesh)]
     edges = {tuple(sorted(e)) for f in faces.tolist() for e in itertools.combinations(f, 2)}
     return len(np.unique(faces)) - len(edges) + len(faces)
 
@@ -79,7 +80,7 @@ def test_heat_sink_errors(bad):
 
 
 def test_other_heat_sinks():
-    for kw in ({"fins": 1, "resolution": 3}, {"fins": 2, "resolution": 4}):
+    for kw in ({"fins": 1, "resolution": 3}, {"fins": 2, "resolution": 2}):
         mesh = datasets.heat_sink(**kw)
         assert mesh.report.warning() is None and euler(mesh) == 2
 
@@ -94,9 +95,7 @@ def test_finite_elements_converge_with_second_order(cell):
 
     def gradient(p):
         x, y, z = p.T
-        return np.stack(
-            [2 * np.cos(2 * x) * np.cos(y), -np.sin(2 * x) * np.sin(y), 2 * z], 1
-        )
+        return np.stack([2 * np.cos(2 * x) * np.cos(y), -np.sin(2 * x) * np.sin(y), 2 * z], 1)
 
     errors = []
     for n in (4, 8):
@@ -131,9 +130,7 @@ def test_cylinder_flow_is_a_closed_ring(dtype):
         assert mesh.n_tets == 6 * 4 * 12 * 3 and mesh.report.warning() is None
         assert mesh.report.duplicate_points == (0 if closed else 5 * 4)
         assert mesh.report.seams == (0 if closed else 2 * 4 * 3)
-        assert mesh.n_boundary == 2 * (2 * 4 * 12 + 2 * 12 * 3) and euler(mesh) == (
-            0 if closed else len(np.unique(boundary_faces(mesh))) - mesh.n_points + euler(mesh)
-        )
+        assert mesh.n_boundary == 2 * (2 * 4 * 12 + 2 * 12 * 3) and euler(mesh) == 0
         assert count_components(mesh.neighbors)[0] == 1
 
 

@@ -1,6 +1,9 @@
-"""`read_mesh`, `list_fields` and `write_mesh`: fields, round trips, and files that are no meshes."""
+"""`read_mesh`, `list_fields`, `write_mesh`: fields, round trips, and files that are no meshes."""
 
+import contextlib
+import io
 import warnings
+from typing import Any
 
 import meshio
 import numpy as np
@@ -89,7 +92,7 @@ def test_list_fields(sample):
 @pytest.mark.parametrize(
     ("field", "message"),
     [
-        ("density", r"has no field 'density'. It has .*'t' \(point\).*'v' \(point, 3 components\)"),
+        ("density", r"has no field 'density'. It has .*'v' \(point, 3 components\), 't' \(point\)"),
         ("v", r'field="v.x".*field="v.magnitude"'),
         ("v.w", "'w' was asked for"),
         ("v.3", "3 component"),
@@ -110,7 +113,7 @@ def test_bad_location(sample):
 
 def test_only_vectors_or_nothing(tmp_path):
     path = tmp_path / "bare.vtu"
-    cells = [("hexahedron", np.arange(8)[None])]
+    cells: list[Any] = [("hexahedron", np.arange(8)[None])]
     meshio.Mesh(CUBE, cells, point_data={"v": CUBE}).write(path)
     with pytest.raises(ValueError, match="no scalar field to take.*magnitude"):
         read_mesh(path)
@@ -133,8 +136,6 @@ def same(a: TetMesh, b: TetMesh):
             m.location, lambda: np.repeat(values[:, None], 4, 1)
         )()
         rows = np.concatenate([np.asarray(m.points)[cells], v[..., None]], 2)
-        order = np.lexsort(rows.transpose(2, 0, 1).reshape(-1, 4 * len(rows))[:, : rows.shape[0]])
-        assert len(order) == len(rows)
         return sorted(sorted(map(tuple, r)) for r in rows.tolist())
 
     assert flat(a) == flat(b)
@@ -207,7 +208,7 @@ def attempt(path):
     return True
 
 
-@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".xdmf", ".su2", ".mesh"])
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".su2", ".mesh", ".ply", ".tec"])
 def test_damaged_files(tmp_path, suffix):
     source = tmp_path / f"good{suffix}"
     mesh = meshio.Mesh(
@@ -215,11 +216,9 @@ def test_damaged_files(tmp_path, suffix):
         [("tetra", np.asarray(BOX.cells))],
         point_data={"t": np.asarray(BOX.values)},
     )
-    if suffix == ".xdmf":
-        meshio.xdmf.write(source, mesh, data_format="XML")
-    else:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+    with warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
+        warnings.simplefilter("ignore")
+        with contextlib.redirect_stdout(io.StringIO()):
             mesh.write(source)
     raw = source.read_bytes()
     path = tmp_path / f"bad{suffix}"

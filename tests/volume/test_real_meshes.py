@@ -88,7 +88,9 @@ def test_invariants(load, name):
     assert np.array_equal(opposite, same_bits)
     b = np.asarray(mesh.boundary)
     cb, fb = packing.cell_of(b), packing.corner_of(b)
-    assert len(np.unique(4 * cb + fb)) == len(b) == (words < 0).sum() and (words[cb, fb] == -1).all()
+    assert (
+        len(np.unique(4 * cb + fb)) == len(b) == (words < 0).sum() and (words[cb, fb] == -1).all()
+    )
     tau = sign[cb] * np.where(packing.turned_of(b) == 1, -1, 1)
     entry = np.where(fb % 2 == 1, tau, -tau) > 0
     assert np.array_equal(packing.flag_of(b).astype(bool), entry)

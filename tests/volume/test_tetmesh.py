@@ -1,4 +1,4 @@
-"""`TetMesh.from_cells`, `replace` and `describe`: what comes in, where values go, what is repaired."""
+"""`TetMesh.from_cells`, `replace`, `describe`: what comes in, where values go, what is repaired."""
 
 import dataclasses
 
@@ -159,7 +159,9 @@ def test_inverted_and_degenerate_cells_are_repaired_with_one_warning():
 
 def test_flat_cells_go_however_large_or_small():
     for scale in (1e-12, 1.0, 1e12):
-        flat = np.array([[0.1, 0.3, 0.7], [1.1, 0.3, 0.7], [0.1, 1.3, 0.7], [0.9, 0.8, 0.7]]) * scale
+        flat = (
+            np.array([[0.1, 0.3, 0.7], [1.1, 0.3, 0.7], [0.1, 1.3, 0.7], [0.9, 0.8, 0.7]]) * scale
+        )
         points = np.concatenate([flat, [[0.2, 0.2, 5.0 * scale]]])
         with pytest.warns(UserWarning, match="1 degenerate"):
             mesh = TetMesh.from_cells(
@@ -316,6 +318,13 @@ def test_describe_is_a_page():
     text = datasets.heat_sink().describe()
     for part in ("hexahedron", "wedge", "pyramid", "tetra", "repaired", "one piece", "boundary"):
         assert part in text
-    for part in ("box", "dihedral", "edge ratio", "volumes", "temperature, point data", "bytes per"):
+    for part in (
+        "box",
+        "dihedral",
+        "edge ratio",
+        "volumes",
+        "temperature, point data",
+        "bytes per",
+    ):
         assert part in text
     assert len(text.splitlines()) < 20 and max(map(len, text.splitlines())) <= 100

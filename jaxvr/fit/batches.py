@@ -1,0 +1,253 @@
+"""The rays of all views, as minibatches of one shape.
+
+A batch is a set of rays with their target colours. With cached segments it is a `Segments` of its
+own: the runs of its rays, copied together in the order of their lengths (rays are shaded many at a
+time, in lock step, so that neighbours in the list had better end together; along stored segments
+it does not matter where in the image they are). Without, it is their origins and directions, in
+the order of image tiles. All batches of a fit have one number of rays and one size of buffers, so
+one compiled function serves them all; the last is filled up with rays of the first.
+
+Rays are dealt to the batches once, at random from the seed, and batches keep their rays: a copy of
+the segments, and no gathering while the fit runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvr._core.checks import as_floats, require_finite
+from jaxvr._core.pytree import pytree
+from jaxvr.render import trace
+from jaxvr.trace import Segments
+from jaxvr.view.camera import Camera
+
+Array = jax.Array
+
+_ROUND = 1 << 16  # buffers are as long as the next multiple of this many nodes
+_CHUNK = 1 << 16  # rays copied at once
+
+
+@pytree
+class Batch:
+    """rays: `Segments` of R rays, or their (origins, directions) (R, 3); target (R, C)."""
+
+    rays: Any
+    target: Array
+
+
+@pytree
+class Views:
+    """All views of a fit, on the host. P: pixels of all of them, view after view.
+
+    shapes: (height, width) of each view. targets (P, C). dtype: of scalars and colours.
+    nodes: (scalar, length) of all segments, with first, end (P,): the run of each pixel; or
+    rays: (origins, directions) (P, 3), with first = tile order, end None.
+    """
+
+    shapes: list[tuple[int, int]]
+    targets: Any
+    nodes: Any
+    first: Any
+    end: Any
+
+    @property
+    def cached(self) -> bool:
+        return self.end is not None
+
+    @property
+    def pixels(self) -> int:
+        return len(self.targets)
+
+    def split(self, flat: Any) -> list[Any]:
+        """Images (height, width, C), one a view, of colours (P, C)."""
+        ends = np.cumsum([h * w for h, w in self.shapes])[:-1]
+        parts = np.split(flat, ends)
+        return [x.reshape(*s, -1) for x, s in zip(parts, self.shapes, strict=True)]
+
+
+def gather_views(
+    volume: Any, cameras: Any, targets: Any, *, cache: bool, tracer: Any, background: Any
+) -> Views:
+    """Checked views: cameras with targets, traced if `cache`. Raises ValueError."""
+    cameras = _listed(cameras)
+    images = _images(targets, cameras, background)
+    shapes = [_shape(c) for c in cameras]
+    flat = np.concatenate([x.reshape(-1, x.shape[-1]) for x in images])
+    traced = [isinstance(c, Segments) for c in cameras]
+    if any(traced) and not cache:
+        raise ValueError("cache=False renders anew, but some of the cameras are Segments.")
+    if volume is None and not all(traced):
+        raise ValueError("volume is None, but not all of the cameras are Segments.")
+    if not cache:
+        rays = [tuple(np.asarray(x).reshape(-1, 3) for x in c.rays()) for c in cameras]
+        origins, directions = (np.concatenate(x) for x in zip(*rays, strict=True))
+        dtype = np.asarray(volume.points).dtype
+        nodes = origins.astype(dtype), directions.astype(dtype)
+        return Views(shapes, flat.astype(dtype), nodes, _tile_rank(shapes), None)
+    parts = [c if isinstance(c, Segments) else trace(volume, c, tracer=tracer) for c in cameras]
+    first, end, offset = [], [], 0
+    for part in parts:
+        start = np.asarray(part.start).astype(np.int64)
+        place = np.argsort(np.asarray(part.order))  # the ray of each pixel
+        first.append(offset + start[:-1][place])
+        end.append(offset + start[1:][place])
+        offset += int(start[-1])
+    scalar, length = (
+        np.concatenate([np.asarray(getattr(p, name))[: int(p.start[-1])] for p in parts])
+        for name in ("scalar", "length")
+    )
+    nodes = scalar, length
+    return Views(
+        shapes, flat.astype(scalar.dtype), nodes, np.concatenate(first), np.concatenate(end)
+    )
+
+
+def deal(views: Views, per_batch: Any, views_per_batch: Any, seed: int) -> list[np.ndarray]:
+    """The pixels of each batch: all, `per_batch` random ones, or those of some whole views."""
+    pixels = views.pixels
+    if per_batch is not None and views_per_batch is not None:
+        raise ValueError("Pass rays= or views=, not both.")
+    rng = np.random.default_rng(seed)
+    if views_per_batch is not None:
+        n = _count("views", views_per_batch, len(views.shapes), "the views")
+        if len(set(views.shapes)) > 1:
+            raise ValueError(
+                f"views= needs views of one size, but there are {sorted(set(views.shapes))}. "
+                "Pass rays= instead."
+            )
+        size = pixels // len(views.shapes)
+        order = _rounded(rng.permutation(len(views.shapes)), n)
+        return [
+            (group[:, None] * size + np.arange(size)).ravel() for group in order.reshape(-1, n)
+        ]
+    if per_batch is None:
+        return [np.arange(pixels)]
+    n = _count("rays", per_batch, pixels, "all rays")
+    if n == pixels:
+        return [np.arange(pixels)]
+    return list(_rounded(rng.permutation(pixels), n).reshape(-1, n))
+
+
+def make_batches(views: Views, dealt: list[np.ndarray]) -> tuple[list[Batch], list[np.ndarray]]:
+    """Batches on the device, and the pixel of each of their rays."""
+    if not views.cached:
+        sets = [p[np.argsort(views.first[p], kind="stable")] for p in dealt]
+        made = [
+            Batch(
+                tuple(jnp.asarray(x[p]) for x in views.nodes), jnp.asarray(views.targets[p])
+            )
+            for p in sets
+        ]
+        return made, sets
+    size = views.end - views.first
+    sets = [p[np.argsort(size[p], kind="stable")] for p in dealt]
+    largest = max(int(size[p].sum()) for p in sets)
+    if largest >= 2**31:
+        raise ValueError(
+            f"{largest} nodes in one batch do not fit 32-bit indices. Pass rays= or views= to "
+            "take fewer rays at once."
+        )
+    total = -(-max(largest, 1) // _ROUND) * _ROUND
+    made = [Batch(_runs(views, p, total), jnp.asarray(views.targets[p])) for p in sets]
+    return made, sets
+
+
+def _runs(views: Views, pixels: np.ndarray, total: int) -> Segments:
+    """The segments of some pixels, one after the other, in buffers of `total` nodes."""
+    first, size = views.first[pixels], (views.end - views.first)[pixels]
+    start = np.concatenate([[0], np.cumsum(size)])
+    out = [np.zeros(total, x.dtype) for x in views.nodes]
+    for lo in range(0, len(pixels), _CHUNK):
+        hi = min(lo + _CHUNK, len(pixels))
+        shift = np.repeat(first[lo:hi] - start[lo:hi], size[lo:hi])
+        source = shift + np.arange(start[lo], start[hi])
+        for x, y in zip(out, views.nodes, strict=True):
+            x[start[lo] : start[hi]] = y[source]
+    rays = len(pixels)
+    return Segments(
+        *(jnp.asarray(x) for x in out),
+        start=jnp.asarray(start, jnp.int32),
+        status=jnp.zeros(rays, jnp.int32),
+        order=jnp.arange(rays, dtype=jnp.int32),
+        shape=(rays,),
+        count=total,  # the same for all, since it is part of what is compiled for
+    )
+
+
+def _rounded(order: np.ndarray, n: int) -> np.ndarray:
+    """`order`, filled up from its beginning to a multiple of n."""
+    return np.resize(order, -(-len(order) // n) * n)
+
+
+def _tile_rank(shapes: list[tuple[int, int]], side: int = 16) -> np.ndarray:
+    """The rank of each pixel when views are read tile by tile."""
+    ranks, offset = [], 0
+    for height, width in shapes:
+        rows, columns = (x.ravel() for x in np.mgrid[0:height, 0:width])
+        order = np.lexsort((columns, rows, columns // side, rows // side))
+        rank = np.empty(len(order), np.int64)
+        rank[order] = offset + np.arange(len(order))
+        ranks.append(rank)
+        offset += len(order)
+    return np.concatenate(ranks)
+
+
+def _count(name: str, n: Any, most: int, what: str) -> int:
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or not 1 <= n:
+        raise ValueError(f"{name} must be a whole number of at least 1 ({what}), but is {n!r}.")
+    return min(int(n), most)
+
+
+def _listed(cameras: Any) -> list[Any]:
+    cameras = [cameras] if isinstance(cameras, Camera | Segments) else cameras
+    if not isinstance(cameras, Sequence):
+        raise ValueError(f"cameras must be a list of jaxvr.Camera, not {type(cameras).__name__}.")
+    for k, c in enumerate(cameras):
+        if not isinstance(c, Camera | Segments):
+            raise ValueError(
+                f"cameras[{k}] must be a jaxvr.Camera or jaxvr.Segments, not {type(c).__name__}."
+            )
+        if isinstance(c, Segments) and len(c.shape) != 2:
+            raise ValueError(f"cameras[{k}] are segments of rays {c.shape}, not of an image.")
+    if not cameras:
+        raise ValueError("cameras is empty: a fit needs at least one view.")
+    return list(cameras)
+
+
+def _shape(camera: Any) -> tuple[int, int]:
+    return camera.shape if isinstance(camera, Segments) else (camera.height, camera.width)
+
+
+def _images(targets: Any, cameras: list[Any], background: Any) -> list[np.ndarray]:
+    if getattr(targets, "ndim", None) == 3:
+        targets = [targets]
+    try:
+        number = len(targets)
+    except TypeError:
+        raise ValueError(f"targets must be images, not {type(targets).__name__}.") from None
+    if number != len(cameras):
+        raise ValueError(f"There are {len(cameras)} cameras, but {number} targets.")
+    out = []
+    for k, (image, camera) in enumerate(zip(targets, cameras, strict=True)):
+        image = np.asarray(as_floats(f"targets[{k}]", image))
+        want = _shape(camera)
+        if image.ndim != 3 or image.shape[:2] != want or image.shape[2] not in (3, 4):
+            raise ValueError(
+                f"targets[{k}] must have shape {(*want, 4)} as its camera has, "
+                f"or {(*want, 3)}, but has {image.shape}."
+            )
+        require_finite(f"targets[{k}]", image)
+        out.append(image)
+    channels = {x.shape[2] for x in out}
+    if len(channels) > 1:
+        raise ValueError("Some targets are RGBA and some RGB. Pass one kind.")
+    if channels == {3} and background is None:
+        raise ValueError(
+            "Targets without alpha need background=, the colour (3,) that they were made on."
+        )
+    return out

@@ -1,0 +1,288 @@
+"""`fit`: the transfer function that makes a volume look as it does in given pictures.
+
+As in DiffDVR (Weiss and Westermann, "Differentiable direct volume rendering", 2021), a gradient
+descent through the renderer on a loss between images, with colours behind a sigmoid and
+extinctions behind a softplus. Unlike there, segments are exact, and they are found once: with fixed
+views they do not depend on what is fitted, so that an iteration only shades (`cache=True`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from jaxvr._core.checks import as_floats, require_finite, require_shape
+from jaxvr._core.status import check
+from jaxvr.adjoint import AbstractAdjoint
+from jaxvr.composite import Over
+from jaxvr.fit.batches import Batch, Views, deal, gather_views, make_batches
+from jaxvr.fit.loop import Control, run
+from jaxvr.fit.losses import loss_of
+from jaxvr.fit.losses import smoothness as roughness
+from jaxvr.fit.parameters import Parameters
+from jaxvr.fit.report import FitResult, likeness, number, timing
+from jaxvr.optics import AbstractIntegrator, TransferFunction
+from jaxvr.render import render_rays, shade
+from jaxvr.trace import AbstractTracer, Segments
+
+Array = jax.Array
+
+
+def fit(
+    transfer: TransferFunction,
+    volume: Any,
+    cameras: Any,
+    targets: Any,
+    *,
+    free: Any = ("colors", "extinctions"),
+    loss: Any = "l1",
+    smoothness: Any = 0.0,
+    smoothness_extinctions: Any = 0.0,
+    optimizer: optax.GradientTransformation | None = None,
+    learning_rate: Any = 0.1,
+    iterations: int = 200,
+    rays: int | None = None,
+    views: int | None = None,
+    seed: int = 0,
+    background: Any = None,
+    cache: bool = True,
+    held_out: tuple[Any, Any] | None = None,
+    progress: bool | None = None,
+    callback: Callable[[int, float, TransferFunction], Any] | None = None,
+    patience: int | None = None,
+    tolerance: float = 1e-3,
+    checkpoint: Any = None,
+    checkpoint_every: int = 50,
+    resume: bool = False,
+    tracer: AbstractTracer | None = None,
+    integrator: AbstractIntegrator | None = None,
+    compositor: Over | None = None,
+    adjoint: AbstractAdjoint | None = None,
+) -> FitResult:
+    """Fits a transfer function to pictures of a volume.
+
+    Args:
+      transfer: the start (K control points). Extinctions of about the right size help: their mean
+        is the size of the optimiser's steps. `jaxvr.fit.noise` makes a random one.
+      volume: a `TetMesh`; None if all cameras are `Segments`.
+      cameras: one or more `Camera`s, or `Segments` that `trace` gave for them (for several fits of
+        the same views). Sizes may differ.
+      targets: a picture for each camera, (height, width, 4) premultiplied linear RGBA, or
+        (height, width, 3) on an opaque `background`.
+      free: which fields move: names among "colors", "extinctions", "positions", or a dict from
+        names to transforms; see `jaxvr.fit.parameters`. Colours then lie in [0, 1], extinctions
+        are >= 0, positions stay sorted and between the first and the last.
+      loss: "l1", "l2", or a function of (predicted, target), both (rays, C), to a scalar.
+      smoothness: weight of the mean squared difference of neighbouring colours (0.4 in DiffDVR):
+        a number, or a schedule from iteration to number. smoothness_extinctions: of neighbouring
+        extinctions, in units of the mean extinction of the start.
+      optimizer: any of optax, on raw parameters; None is `optax.adam(learning_rate)`.
+      learning_rate: of Adam: a number, or a schedule (such as `optax.cosine_decay_schedule`).
+        0.8 is DiffDVR's; fits to high precision want a decay to 0.
+      iterations: steps, one for each minibatch.
+      rays: rays in a minibatch, at random from all views; None takes all. views: whole views in a
+        minibatch instead.
+      seed: of the minibatches. The result is a function of the arguments, bit for bit, on one
+        machine.
+      background: opaque linear RGB (3,) behind the volume; None leaves it transparent.
+      cache: trace each view once and shade after, with 8 bytes of memory a segment (16 in
+        float64). False renders at every iteration.
+      held_out: (cameras, targets) that only the report looks at.
+      progress, patience, tolerance, checkpoint, checkpoint_every, resume: as `fit_parameters`.
+      callback: called after every step with (iteration, loss, transfer); True ends the fit.
+      tracer, integrator, compositor, adjoint: as `render`.
+
+    Returns:
+      FitResult: transfer, loss_history, images, report(), save(folder).
+
+    Raises:
+      ValueError: for arguments that do not fit each other. FitError: if the loss becomes NaN or
+        infinite. RenderError: if a ray could not be followed.
+    """
+    if not isinstance(transfer, TransferFunction):
+        raise ValueError(
+            f"transfer must be a jaxvr.TransferFunction, but is a {type(transfer).__name__}."
+        )
+    begin = time.perf_counter()
+    background = _background(background)
+    look = {"cache": cache, "tracer": tracer, "background": background}
+    seen = gather_views(volume, cameras, targets, **look)
+    unseen = gather_views(volume, *_pair(held_out), **look) if held_out is not None else None
+    dtype = seen.targets.dtype
+    parameters = Parameters.of(transfer.astype(dtype), free)
+    dealt = deal(seen, rays, views, seed)
+    batches, places = make_batches(seen, dealt)
+    nouns = (integrator, compositor, adjoint, tracer)
+    objective = Objective(loss_of(loss), *nouns)
+    weights = [_schedule(n, w) for n, w in _weights(smoothness, smoothness_extinctions)]
+    mean = jnp.mean(parameters.transfer.extinctions)
+    unit = jnp.where(mean > 0, mean, 1).astype(dtype)
+    fixed = parameters, unit, None if cache else volume, background
+
+    def inputs(iteration: int) -> tuple[Any, ...]:
+        from jaxvr.fit.loop import batch_number
+
+        batch = batches[batch_number(iteration, len(batches), seed)]
+        now = np.asarray([w(iteration) for w in weights], dtype)
+        return *fixed, batch, now
+
+    transfer_of = jax.jit(Parameters.transfer_of)
+
+    def told(iteration: int, value: float, raw: Any) -> Any:
+        assert callback is not None
+        return callback(iteration, value, transfer_of(parameters, raw))
+
+    prepared = time.perf_counter() - begin
+    control = Control(
+        *(iterations, seed, progress, patience, tolerance, checkpoint, checkpoint_every, resume)
+    )
+    named = {"free": list(parameters.transforms), "rays": len(places[0]), "loss": _name(loss)}
+    result = run(
+        objective.gradient,
+        parameters.raw(),
+        inputs,
+        len(batches),
+        optimizer,
+        learning_rate,
+        control,
+        told if callback is not None else None,
+        named,
+    )
+    fitted = jax.tree.map(np.asarray, transfer_of(parameters, result.parameters))
+    fitted = TransferFunction(fitted.positions, fitted.colors, fitted.extinctions)
+
+    def pictures(views: Views, batches: Any, places: Any) -> list[np.ndarray]:
+        flat = np.zeros((views.pixels, 4), dtype)
+        for batch, place in zip(batches, places, strict=True):
+            rgba, status = objective.predict(fitted, fixed[2], background, batch.rays)
+            check(status)
+            flat[place] = rgba
+        return views.split(flat)
+
+    images = pictures(seen, batches, places)
+    others = [] if unseen is None else pictures(unseen, *make_batches(unseen, deal(unseen, None, None, 0)))
+    numbers = {
+        "control_points": fitted.positions.shape[0],
+        "views": [list(s) for s in seen.shapes],
+        "rays_per_iteration": len(places[0]),
+        "settings": named
+        | {
+            "smoothness": _name(smoothness),
+            "smoothness_extinctions": _name(smoothness_extinctions),
+            "optimizer": "adam" if optimizer is None else "given",
+            "learning_rate": _name(learning_rate) if optimizer is None else None,
+            "iterations": int(iterations),
+            "seed": int(seed),
+            "cache": bool(cache),
+            "dtype": str(dtype),
+            "background": None if background is None else np.asarray(background).tolist(),
+        },
+        "cached_bytes": sum(b.rays.nbytes for b in batches) if cache else 0,
+        "iterations": len(result.loss_history),
+        "stopped": result.stopped,
+        "loss": [number(x) for x in result.loss_history],
+        "seconds": {"preparation": prepared} | timing(result),
+        "fitted_views": likeness(images, seen.split(seen.targets)),
+        "held_out": [] if unseen is None else likeness(others, unseen.split(unseen.targets)),
+    }
+    return FitResult(fitted, result.loss_history, images, others, result.stopped, numbers)
+
+
+@dataclasses.dataclass(frozen=True)
+class Objective:
+    """The loss of a batch under raw parameters; two of the same nouns compile once."""
+
+    loss: Callable[[Array, Array], Array]
+    integrator: AbstractIntegrator | None
+    compositor: Over | None
+    adjoint: AbstractAdjoint | None
+    tracer: AbstractTracer | None
+
+    @property
+    def gradient(self) -> Callable[..., Any]:
+        """(raw, parameters, unit, volume, background, batch, weights (2,)) to
+        ((loss, status bits), gradient of raw)."""
+        return functools.partial(_gradient, self)
+
+    def predict(self, transfer: Any, volume: Any, background: Any, rays: Any) -> tuple[Any, Any]:
+        """Colours (R, 4) and status bits () or (R,)."""
+        return _predict(self, transfer, volume, background, rays)
+
+
+def _see(
+    objective: Objective, transfer: TransferFunction, volume: Any, background: Any, rays: Any
+) -> tuple[Array, Array]:
+    nouns: dict[str, Any] = {
+        "integrator": objective.integrator,
+        "compositor": objective.compositor,
+        "adjoint": objective.adjoint,
+        "background": background,
+    }
+    if isinstance(rays, Segments):
+        return shade(rays, transfer, **nouns), jnp.zeros((), jnp.int32)
+    return render_rays(volume, *rays, transfer, tracer=objective.tracer, status=True, **nouns)
+
+
+_predict = functools.partial(jax.jit, static_argnums=0)(_see)
+
+
+def _value(
+    raw: Any,
+    objective: Objective,
+    parameters: Parameters,
+    unit: Array,
+    volume: Any,
+    background: Any,
+    batch: Batch,
+    weights: Array,
+) -> tuple[Array, Array]:
+    transfer = parameters.transfer_of(raw)
+    rgba, status = _see(objective, transfer, volume, background, batch.rays)
+    loss = objective.loss(rgba[:, : batch.target.shape[1]], batch.target)
+    prior = weights[0] * roughness(transfer.colors)
+    prior = prior + weights[1] * roughness(transfer.extinctions / unit)
+    return loss + prior, status
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _gradient(objective: Objective, raw: Any, *rest: Any) -> Any:
+    return jax.value_and_grad(_value, has_aux=True)(raw, objective, *rest)
+
+
+def _background(background: Any) -> Array | None:
+    if background is None:
+        return None
+    background = as_floats("background", background)
+    require_shape("background", background, (3,))
+    require_finite("background", background)
+    return jnp.asarray(background)
+
+
+def _pair(held_out: Any) -> tuple[Any, Any]:
+    if not isinstance(held_out, tuple | list) or len(held_out) != 2:
+        raise ValueError("held_out must be (cameras, targets).")
+    return held_out[0], held_out[1]
+
+
+def _weights(colors: Any, extinctions: Any) -> list[tuple[str, Any]]:
+    return [("smoothness", colors), ("smoothness_extinctions", extinctions)]
+
+
+def _schedule(name: str, weight: Any) -> Callable[[int], float]:
+    if callable(weight):
+        return lambda i: float(weight(i))
+    if not (isinstance(weight, int | float | np.number) and 0 <= weight < np.inf):
+        raise ValueError(f"{name} must be a number >= 0 or a schedule, but is {weight!r}.")
+    return lambda i: float(weight)
+
+
+def _name(x: Any) -> Any:
+    return getattr(x, "__name__", type(x).__name__) if callable(x) else x
