@@ -27,7 +27,7 @@ def default_float() -> np.dtype:
 
 def float_dtype(dtype: Any) -> np.dtype:
     """`dtype` as one of the two that jaxvr computes in; float64 only where JAX allows it."""
-    d = np.dtype(dtype)
+    d = np.dtype(dtype).newbyteorder("=")
     if d == np.float64 and default_float() == np.float64:
         return d
     return np.dtype(np.float32) if d.kind == "f" else default_float()

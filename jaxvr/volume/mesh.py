@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.checks import as_floats, is_concrete, require_finite, require_shape
+from .._core.checks import as_floats, require_finite, require_shape
 from .._core.pytree import pytree, static
 from .build import build
 from .report import MeshReport
@@ -111,11 +111,9 @@ class TetMesh:
         return dataclasses.replace(self, **new)
 
     def _floats(self, name: str, x: Any) -> Array:
-        if is_concrete(x):
-            require_finite(name, as_floats(name, x))
-        out = as_floats(name, x, dtype=self.points.dtype)
-        if is_concrete(out):
-            require_finite(name, out)
+        with np.errstate(over="ignore"):  # too large for the dtype is infinite, and found below
+            out = as_floats(name, x, dtype=self.points.dtype)
+        require_finite(name, out)  # looks only where the numbers are known
         return jnp.asarray(out)
 
     @property

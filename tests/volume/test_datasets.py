@@ -1,6 +1,7 @@
 """The generators: real fields on real kinds of mesh; and the finite elements behind the first."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +44,13 @@ def test_box_fields_and_errors():
     values = np.arange(48.0)
     assert datasets.box(field=values).location == "cell"
     assert datasets.box(field=np.ones((48, 4))).location == "corner"
-    for bad in ({"n": (0, 1, 1)}, {"n": (1, 1)}, {"jitter": 0.7}, {"cell": "cube"}):
+    bads: tuple[dict[str, Any], ...] = (
+        {"n": (0, 1, 1)},
+        {"n": (1, 1)},
+        {"jitter": 0.7},
+        {"cell": "cube"},
+    )
+    for bad in bads:
         with pytest.raises(ValueError):
             datasets.box(**bad)
 
@@ -160,6 +167,12 @@ def test_cylinder_flow_solves_the_equations():
 
 
 def test_cylinder_flow_errors():
-    for bad in ({"n": (1, 2, 1)}, {"radius": 5.0}, {"length": 0.0}, {"field": "vorticity"}):
+    bads: tuple[dict[str, Any], ...] = (
+        {"n": (1, 2, 1)},
+        {"radius": 5.0},
+        {"length": 0.0},
+        {"field": "vorticity"},
+    )
+    for bad in bads:
         with pytest.raises(ValueError):
             datasets.cylinder_flow(**bad)

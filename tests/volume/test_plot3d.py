@@ -56,9 +56,7 @@ def test_every_way_of_writing(tmp_path, two, blank):
     # the second block's first face is the first one's last
     if two:
         blocks[1][1][2] += 0.375
-    blanks = [np.ones(p.shape[1], int) if blank else None for _, p in blocks]
-    if blank:
-        blanks[0][0] = 0
+    blanks = [(np.arange(p.shape[1]) > 0) | (p is not one[1]) if blank else None for _, p in blocks]
     data = [(d, p, b) for (d, p), b in zip(blocks, blanks, strict=True)]
     xyz, q = tmp_path / "grid.xyz", tmp_path / "grid.q"
     for order, markers, counted, width in itertools.product(

@@ -269,6 +269,9 @@ def test_replace_checks_shapes_always_and_numbers_when_it_can():
         mesh.replace(location="cell")
     with pytest.raises(ValueError, match="must hold numbers"):
         mesh.replace(values="zeros")
+    small = datasets.box((1, 1, 1), dtype="float32")
+    with pytest.raises(ValueError, match="8 NaN or infinite"):
+        small.replace(values=np.full(8, 1e60))
     assert jnp.isnan(jax.jit(lambda v: mesh.replace(values=v).values)(np.full(27, np.nan))).all()
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda p: TetMesh.from_cells(p, {"tetra": mesh.cells}, mesh.values).points)(
