@@ -27,8 +27,7 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +36,7 @@ import jaxvr
 from jaxvr.volume import read_mesh
 from tests.reference import Reference
 
+ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("JAXVR_DATA", ROOT.parent / "shared" / "data"))
 VECTORS = Path(os.environ.get("JAXVR_VECTORS", ROOT.parent / "shared" / "vectors"))
 
@@ -206,9 +206,7 @@ def compare(
         "worst_alpha": float(np.abs(rgba - exact)[clear, 3].max()),
         "q9999": float(np.quantile(error[clear], 0.9999)),
         "median": float(np.median(error[clear])),
-        "families": {
-            str(k): float(error[clear & (names == k)].max(initial=0)) for k in families
-        },
+        "families": {str(k): float(error[clear & (names == k)].max(initial=0)) for k in families},
         "reference_seconds": seconds,
     }
 
@@ -259,10 +257,10 @@ def check_slab(path: Path, dtype: str) -> dict[str, float]:
     x = jnp.asarray(np.concatenate(columns, 1))
     value = np.asarray(jax.jit(jax.vmap(slab))(x), np.float64)
     largest = np.maximum(np.abs(get["C_f"]).max(1), np.abs(get["C_b"]).max(1))
-    tau_f, tau_b, l = get["tau_f"], get["tau_b"], get["l"]
+    tau_f, tau_b, length = get["tau_f"], get["tau_b"], get["l"]
     _, b_1, b_2 = get["B"].T
-    by = np.stack([l * (b_1 + b_2) / 2, l * b_2 / 2, (tau_f * (b_1 + b_2) + tau_b * b_2) / 2], 1)
-    scale = np.zeros((len(l), 4, 9))
+    by = 0.5 * np.stack([length * (b_1 + b_2), length * b_2, tau_f * (b_1 + b_2) + tau_b * b_2], 1)
+    scale = np.zeros((len(length), 4, 9))
     scale[:, :3, [0, 1, 8]] = (largest[:, None] * by)[:, None]
     scale[:, 3, [0, 1, 8]] = by
     scale[:, :3, 2:5] = get["w_f"][:, None, None]
@@ -284,7 +282,7 @@ def check_slab(path: Path, dtype: str) -> dict[str, float]:
 
 
 def main(arguments: Any = None) -> list[dict[str, Any]]:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rays", type=int, default=20000, help="on each mesh and dtype")
     parser.add_argument("--meshes", nargs="+", default=list(FIELDS), choices=list(FIELDS))
     parser.add_argument("--dtypes", nargs="+", default=["float64", "float32"])
@@ -318,7 +316,11 @@ def main(arguments: Any = None) -> list[dict[str, Any]]:
         for dtype in options.dtypes:
             r = {"slab": dtype, **check_slab(vectors, dtype)}
             results.append(r)
-            print(" ".join(f"{k} {v:.1e}" if isinstance(v, float) else f"{k} {v}" for k, v in r.items()))
+            print(
+                " ".join(
+                    f"{k} {v:.1e}" if isinstance(v, float) else f"{k} {v}" for k, v in r.items()
+                )
+            )
     else:
         print(f"no vectors at {vectors}: set JAXVR_VECTORS")
     if options.json:

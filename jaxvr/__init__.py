@@ -15,12 +15,52 @@ Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, 
 `trace`, `composite`, `adjoint`, `render`, `fit`, `plot`, `cli`.
 """
 
-from jaxvr import optics
 from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay
 from jaxvr.composite import Over
+from jaxvr.fit import FitError, FitResult, fit, fit_parameters
 from jaxvr.optics import Analytic, Quadrature, TransferFunction
 from jaxvr.render import render, render_rays, shade, trace
 from jaxvr.trace import RayCast, Segments
-from jaxvr.view.camera import Camera
-from jaxvr.volume.mesh import TetMesh
+from jaxvr.view import Camera, psnr, ssim
+from jaxvr.volume import (
+    TetMesh,
+    datasets,
+    list_fields,
+    read_mesh,
+    read_plot3d,
+    write_mesh,
+)
+
+# `jaxvr.plot` is not imported here: it needs matplotlib, which takes a while to load.
+__all__ = [
+    "Analytic",
+    "Camera",
+    "Direct",
+    "FitError",
+    "FitResult",
+    "Forward",
+    "Over",
+    "Quadrature",
+    "RayCast",
+    "RenderError",
+    "Replay",
+    "Segments",
+    "TetMesh",
+    "TransferFunction",
+    "check",
+    "datasets",
+    "fit",
+    "fit_parameters",
+    "list_fields",
+    "psnr",
+    "read_mesh",
+    "read_plot3d",
+    "render",
+    "render_rays",
+    "shade",
+    "ssim",
+    "trace",
+    "write_mesh",
+]
+__version__ = "0.1.0"

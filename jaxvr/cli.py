@@ -51,8 +51,9 @@ def main(argv: list[str] | None = None) -> int:
 def info(arguments: Any) -> None:
     """What a file holds, and the mesh made of it."""
     if not _is_plot3d(arguments):
+        fields = list_fields(arguments.file)
         print("fields")
-        for f in list_fields(arguments.file):
+        for f in fields:
             size = "" if f.components == 1 else f", {f.components} components"
             print(f"  {f.name} ({f.location}{size})")
     print(_mesh(arguments).describe())
@@ -172,9 +173,8 @@ def _transfer(source: str, mesh: TetMesh, arguments: Any) -> TransferFunction:
     else:
         positions = np.linspace(lo, hi, 33) if hi > lo else np.array([lo])
         ramp = np.linspace(0, 1, len(positions)) if hi > lo else np.ones(1)
-        transfer = TransferFunction.from_colormap(
-            source, positions, _DEPTH / _diagonal(mesh) * ramp, dtype=mesh.dtype
-        )
+        extinctions = (_DEPTH / _diagonal(mesh) * ramp).astype(mesh.dtype)
+        transfer = TransferFunction.from_colormap(source, positions, extinctions, dtype=mesh.dtype)
     return transfer.scaled(arguments.opacity)
 
 
@@ -182,11 +182,11 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="jaxvr", description="Differentiable volume rendering of unstructured meshes."
     )
+    shown = " (%(default)s)"
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
-    defaults = argparse.ArgumentDefaultsHelpFormatter
 
     def command(name: str, run: Any, about: str) -> argparse.ArgumentParser:
-        made = commands.add_parser(name, help=about, description=about, formatter_class=defaults)
+        made = commands.add_parser(name, help=about, description=about)
         made.set_defaults(run=run)
         made.add_argument("file", metavar="FILE", help="a mesh file that meshio reads, or PLOT3D")
         made.add_argument("--field", help="its field (name, name.x, name.magnitude)")
@@ -199,14 +199,14 @@ def _parser() -> argparse.ArgumentParser:
             type=float,
             default=1.0,
             metavar="X",
-            help="factor on all extinctions",
+            help="factor on all extinctions (%(default)s)",
         )
         made.add_argument(
             "--unit-distance",
             type=float,
             default=1.0,
             metavar="L",
-            help="the length that opacities of a ParaView colour map are for",
+            help="length that opacities of a ParaView colour map are for (%(default)s)",
         )
         made.add_argument(
             "--background", type=float, nargs=3, metavar=("R", "G", "B"), help="else transparent"
@@ -219,7 +219,7 @@ def _parser() -> argparse.ArgumentParser:
         "--tf",
         default="viridis",
         help="transfer function: a .json file (of jaxvr or ParaView), or the name of a colour map, "
-        "with extinction rising from 0",
+        "with extinction rising from 0" + shown,
     )
     optics(made)
     for name, default, about in (
@@ -228,9 +228,9 @@ def _parser() -> argparse.ArgumentParser:
         ("zoom", 1.0, "magnification; at 1 the bounding ball fits"),
         ("fov", 30.0, "vertical field of view in degrees"),
     ):
-        made.add_argument(f"--{name}", type=float, default=default, metavar="X", help=about)
+        made.add_argument(f"--{name}", type=float, default=default, metavar="X", help=about + shown)
     for name in ("width", "height"):
-        made.add_argument(f"--{name}", type=int, default=512, metavar="N", help="pixels")
+        made.add_argument(f"--{name}", type=int, default=512, metavar="N", help="pixels" + shown)
     made.add_argument(
         *("-o", "--output"),
         required=True,
@@ -253,7 +253,7 @@ def _parser() -> argparse.ArgumentParser:
         ("size", 128, "pixels along a side of the pictures"),
         ("seed", 0, "of the noise to start from"),
     ):
-        made.add_argument(f"--{name}", type=int, default=default, metavar="N", help=about)
+        made.add_argument(f"--{name}", type=int, default=default, metavar="N", help=about + shown)
     made.add_argument("--checkpoint", metavar="FILE", help="written, and resumed from if it exists")
     made.add_argument("--quiet", action="store_true", help="no progress bar")
     made.add_argument("-o", "--output", required=True, metavar="FOLDER", help="pictures, report")

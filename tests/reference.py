@@ -1,16 +1,16 @@
 """Brute force in NumPy: what a ray sees, from every cell that it meets. Shares no code with jaxvr.
 
-Each cell is clipped by the ray (four half-spaces, an interval of depths, cut off at the origin); the
-scalar is linear in the cell; pieces are sorted by entry depth, split where they cross control
+Each cell is clipped by the ray (four half-spaces, an interval of depths, cut off at the origin);
+the scalar is linear in the cell; pieces are sorted by entry depth, split where they cross control
 points, integrated by Gauss-Legendre quadrature and composited.
 
 Geometry is in `np.longdouble` (64 bits of mantissa where the hardware has them), so that the error
 of the reference itself is far below that of what it is compared with. A ray that lies in a face
 belongs to the cell on one side of it: every ray is moved sideways by 1024 epsilons (some 1e-16) of
-the mesh's diagonal, in a direction that has nothing to do with the mesh, which is above the rounding
-of the half-spaces and below everything else. Where the field is continuous that is no change; a ray that
-lies in the *boundary*, or between cells with different values, has no value of its own, and
-`Reference.ambiguous` finds it.
+the mesh's diagonal, in a direction that has nothing to do with the mesh, which is above the
+rounding of the half-spaces and below everything else. Where the field is continuous that is no
+change; a ray that lies in the *boundary*, or between cells with different values, has no value of
+its own, and `Reference.ambiguous` finds it.
 
 Neighbouring cells find the depth of their common face from the same numbers in the same order (rows
 of `mesh.cells` are sorted alike), so that chords add up without gaps.
@@ -24,6 +24,10 @@ import numpy as np
 
 Exact = np.longdouble
 SIDEWAYS = np.array([0.5641895835477563, 0.7316738548391265, 0.3819660112501051])
+# Along a convex edge of the boundary most directions lead outside, so doubts need more than two.
+SIGNS = (np.ones(3), np.array([1, -1, 1]))
+_turned = np.concatenate([np.roll(SIDEWAYS, k) * s for k in range(3) for s in SIGNS])
+AROUND = np.concatenate([_turned, -_turned]).reshape(-1, 3)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 # 20 points are good to 1e-15 up to this optical depth; thicker slabs are cut into equal parts.
 THICK = 4.0
@@ -119,14 +123,17 @@ class Reference:
                 ray, node = ray[there], node[there]
         return ray, self.order[node]
 
-    def pieces(self, origins: Any, directions: Any, shift: float | None = None) -> Pieces:
-        """Chords of rays (R, 3); depths are world lengths from the origin."""
+    def pieces(self, origins: Any, directions: Any, shift: Any = None) -> Pieces:
+        """Chords of rays (R, 3); depths are world lengths from the origin.
+
+        shift: how far rays are moved, in diagonals: a number, or a vector (3,).
+        """
         origins = np.asarray(origins, np.float64)
         directions = np.asarray(directions, np.float64)
         ray, cell = self.candidates(origins, directions)
         exact = self.exact
-        shift = self.shift if shift is None else shift
-        o = origins.astype(exact) + (exact(self.diagonal) * exact(shift)) * SIDEWAYS.astype(exact)
+        move = (self.shift if shift is None else shift) * SIDEWAYS if np.ndim(shift) == 0 else shift
+        o = origins.astype(exact) + exact(self.diagonal) * np.asarray(move).astype(exact)
         d = directions.astype(exact)
         d = d / np.sqrt((d * d).sum(-1, keepdims=True))
         rise = np.zeros((len(ray), 4), exact)
@@ -164,7 +171,7 @@ class Reference:
         return Pieces(*(x[order] for x in kept))
 
     def lengths(
-        self, origins: Any, directions: Any, chunk: int = 64, shift: float | None = None
+        self, origins: Any, directions: Any, chunk: int = 64, shift: Any = None
     ) -> np.ndarray:
         """The total chord (R,) of rays (R, 3)."""
         parts = [slice(i, i + chunk) for i in range(0, len(origins), chunk)]
@@ -173,7 +180,12 @@ class Reference:
         return np.concatenate([np.zeros(0), *sums])
 
     def render(
-        self, origins: Any, directions: Any, transfer: Any, chunk: int = 64, shift: float | None = None
+        self,
+        origins: Any,
+        directions: Any,
+        transfer: Any,
+        chunk: int = 64,
+        shift: Any = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """rgba (R, 4), premultiplied, and the total chord (R,) of rays (R, 3)."""
         table = tuple(
@@ -192,9 +204,12 @@ class Reference:
     def ambiguous(
         self, origins: Any, directions: Any, transfer: Any, by: float, tolerance: float
     ) -> np.ndarray:
-        """Which rays (R,) see something else when moved sideways by `by` of the diagonal."""
-        a, b = (self.render(origins, directions, transfer, shift=s)[0] for s in (-by, by))
-        return np.abs(a - b).max(1) > tolerance
+        """Which rays (R,) see something else when moved by `by` of the diagonal in any of twelve
+        directions."""
+        seen = np.stack(
+            [self.render(origins, directions, transfer, shift=by * u)[0] for u in AROUND]
+        )
+        return np.ptp(seen, axis=0).max(1) > tolerance
 
 
 def chords(pieces: Pieces, count: int) -> np.ndarray:

@@ -13,7 +13,7 @@ the segments, and no gathering while the fit runs.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -30,6 +30,7 @@ Array = jax.Array
 
 _ROUND = 1 << 16  # buffers are as long as the next multiple of this many nodes
 _CHUNK = 1 << 16  # rays copied at once
+_TOGETHER = 1 << 22  # rays traced at once
 
 
 @pytree
@@ -63,6 +64,18 @@ class Views:
     def pixels(self) -> int:
         return len(self.targets)
 
+    def parted(self, number: int) -> tuple[Views, Views]:
+        """The first views, and the others."""
+        n = sum(h * w for h, w in self.shapes[:number])
+
+        def part(which: slice, pixels: slice) -> Views:
+            end = None if self.end is None else self.end[pixels]
+            nodes = self.nodes if self.cached else tuple(x[pixels] for x in self.nodes)
+            shapes, targets = self.shapes[which], self.targets[pixels]
+            return Views(shapes, targets, nodes, self.first[pixels], end)
+
+        return part(slice(number), slice(n)), part(slice(number, None), slice(n, None))
+
     def split(self, flat: Any) -> list[Any]:
         """Images (height, width, C), one a view, of colours (P, C)."""
         ends = np.cumsum([h * w for h, w in self.shapes])[:-1]
@@ -71,10 +84,15 @@ class Views:
 
 
 def gather_views(
-    volume: Any, cameras: Any, targets: Any, *, cache: bool, tracer: Any, background: Any
+    volume: Any,
+    cameras: list[Any],
+    targets: list[Any],
+    *,
+    cache: bool,
+    tracer: Any,
+    background: Any,
 ) -> Views:
     """Checked views: cameras with targets, traced if `cache`. Raises ValueError."""
-    cameras = _listed(cameras)
     images = _images(targets, cameras, background)
     shapes = [_shape(c) for c in cameras]
     flat = np.concatenate([x.reshape(-1, x.shape[-1]) for x in images])
@@ -83,38 +101,76 @@ def gather_views(
         raise ValueError("cache=False renders anew, but some of the cameras are Segments.")
     if volume is None and not all(traced):
         raise ValueError("volume is None, but not all of the cameras are Segments.")
-    if not cache:
-        rays = [tuple(np.asarray(x).reshape(-1, 3) for x in c.rays()) for c in cameras]
-        origins, directions = (np.concatenate(x) for x in zip(*rays, strict=True))
-        dtype = np.asarray(volume.points).dtype
-        nodes = origins.astype(dtype), directions.astype(dtype)
-        return Views(shapes, flat.astype(dtype), nodes, _tile_rank(shapes), None)
-    parts = [c if isinstance(c, Segments) else trace(volume, c, tracer=tracer) for c in cameras]
+    if all(traced):
+        parts = [(c, np.asarray(c.order)) for c in cameras]
+        dtype = np.asarray(cameras[0].scalar).dtype
+    else:
+        dtype = np.dtype(volume.points.dtype)
+        if not cache:
+            nodes = _rays(cameras, dtype)
+            return Views(shapes, flat.astype(dtype), nodes, _tile_rank(shapes), None)
+        parts = list(_trace(volume, cameras, tracer, dtype))
     first, end, offset = [], [], 0
-    for part in parts:
+    for part, order in parts:
         start = np.asarray(part.start).astype(np.int64)
-        place = np.argsort(np.asarray(part.order))  # the ray of each pixel
+        place = np.argsort(order)  # the ray of each pixel
         first.append(offset + start[:-1][place])
         end.append(offset + start[1:][place])
         offset += int(start[-1])
-    scalar, length = (
-        np.concatenate([np.asarray(getattr(p, name))[: int(p.start[-1])] for p in parts])
+    nodes = tuple(
+        np.concatenate([np.asarray(getattr(p, name))[: int(p.start[-1])] for p, _ in parts])
         for name in ("scalar", "length")
     )
-    nodes = scalar, length
-    return Views(
-        shapes, flat.astype(scalar.dtype), nodes, np.concatenate(first), np.concatenate(end)
+    first, end = np.concatenate(first), np.concatenate(end)
+    return Views(shapes, flat.astype(dtype), nodes, first, end)
+
+
+def _trace(volume: Any, cameras: list[Any], tracer: Any, dtype: Any) -> Iterator[Any]:
+    """(Segments, pixel of each ray) of successive views.
+
+    Cameras go together, so that one function is compiled for all, as many as 32-bit indices allow
+    with a few hundred segments a ray.
+    """
+    group: list[Camera] = []
+    for k, c in enumerate(cameras):
+        if isinstance(c, Segments):
+            yield c, np.asarray(c.order)
+            continue
+        group.append(c)
+        after = cameras[k + 1] if k + 1 < len(cameras) else None
+        pixels = sum(g.width * g.height for g in [*group, after] if isinstance(g, Camera))
+        if isinstance(after, Camera) and pixels <= _TOGETHER:
+            continue
+        tiles = np.argsort(_tile_rank([_shape(g) for g in group]))
+        rays = tuple(x[tiles] for x in _rays(group, dtype))
+        part = trace(volume, rays, tracer=tracer)
+        yield part, tiles[np.asarray(part.order)]
+        group = []
+
+
+def _rays(cameras: list[Camera], dtype: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions (P, 3), computed in the volume's dtype as `render` does."""
+    rays = [jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), c).rays() for c in cameras]
+    origins, directions = (
+        np.concatenate([np.asarray(x).reshape(-1, 3) for x in part])
+        for part in zip(*rays, strict=True)
     )
+    return origins, directions
 
 
-def deal(views: Views, per_batch: Any, views_per_batch: Any, seed: int) -> list[np.ndarray]:
-    """The pixels of each batch: all, `per_batch` random ones, or those of some whole views."""
+def deal(
+    views: Views, per_batch: Any, views_per_batch: Any, seed: int, fill: bool = False
+) -> list[np.ndarray]:
+    """The pixels of each batch: all, `per_batch` random ones, or those of some whole views.
+
+    fill: repeat pixels where there are less than `per_batch`.
+    """
     pixels = views.pixels
     if per_batch is not None and views_per_batch is not None:
         raise ValueError("Pass rays= or views=, not both.")
     rng = np.random.default_rng(seed)
     if views_per_batch is not None:
-        n = _count("views", views_per_batch, len(views.shapes), "the views")
+        n = _count("views", views_per_batch, len(views.shapes))
         if len(set(views.shapes)) > 1:
             raise ValueError(
                 f"views= needs views of one size, but there are {sorted(set(views.shapes))}. "
@@ -122,25 +178,26 @@ def deal(views: Views, per_batch: Any, views_per_batch: Any, seed: int) -> list[
             )
         size = pixels // len(views.shapes)
         order = _rounded(rng.permutation(len(views.shapes)), n)
-        return [
-            (group[:, None] * size + np.arange(size)).ravel() for group in order.reshape(-1, n)
-        ]
+        return [(group[:, None] * size + np.arange(size)).ravel() for group in order.reshape(-1, n)]
     if per_batch is None:
         return [np.arange(pixels)]
-    n = _count("rays", per_batch, pixels, "all rays")
+    n = _count("rays", per_batch, per_batch if fill else pixels)
     if n == pixels:
         return [np.arange(pixels)]
     return list(_rounded(rng.permutation(pixels), n).reshape(-1, n))
 
 
-def make_batches(views: Views, dealt: list[np.ndarray]) -> tuple[list[Batch], list[np.ndarray]]:
-    """Batches on the device, and the pixel of each of their rays."""
+def make_batches(
+    views: Views, dealt: list[np.ndarray], least: int = 0
+) -> tuple[list[Batch], list[np.ndarray]]:
+    """Batches on the device, and the pixel of each of their rays.
+
+    least: nodes that buffers hold at least, so that they fit a function compiled for others.
+    """
     if not views.cached:
         sets = [p[np.argsort(views.first[p], kind="stable")] for p in dealt]
         made = [
-            Batch(
-                tuple(jnp.asarray(x[p]) for x in views.nodes), jnp.asarray(views.targets[p])
-            )
+            Batch(tuple(jnp.asarray(x[p]) for x in views.nodes), jnp.asarray(views.targets[p]))
             for p in sets
         ]
         return made, sets
@@ -152,7 +209,7 @@ def make_batches(views: Views, dealt: list[np.ndarray]) -> tuple[list[Batch], li
             f"{largest} nodes in one batch do not fit 32-bit indices. Pass rays= or views= to "
             "take fewer rays at once."
         )
-    total = -(-max(largest, 1) // _ROUND) * _ROUND
+    total = max(-(-max(largest, 1) // _ROUND) * _ROUND, least)
     made = [Batch(_runs(views, p, total), jnp.asarray(views.targets[p])) for p in sets]
     return made, sets
 
@@ -197,13 +254,14 @@ def _tile_rank(shapes: list[tuple[int, int]], side: int = 16) -> np.ndarray:
     return np.concatenate(ranks)
 
 
-def _count(name: str, n: Any, most: int, what: str) -> int:
+def _count(name: str, n: Any, most: int) -> int:
     if isinstance(n, bool) or not isinstance(n, int | np.integer) or not 1 <= n:
-        raise ValueError(f"{name} must be a whole number of at least 1 ({what}), but is {n!r}.")
+        raise ValueError(f"{name} must be a whole number of at least 1, but is {n!r}.")
     return min(int(n), most)
 
 
-def _listed(cameras: Any) -> list[Any]:
+def listed(cameras: Any) -> list[Any]:
+    """Checked cameras or segments; one alone is a list of one."""
     cameras = [cameras] if isinstance(cameras, Camera | Segments) else cameras
     if not isinstance(cameras, Sequence):
         raise ValueError(f"cameras must be a list of jaxvr.Camera, not {type(cameras).__name__}.")
@@ -223,13 +281,18 @@ def _shape(camera: Any) -> tuple[int, int]:
     return camera.shape if isinstance(camera, Segments) else (camera.height, camera.width)
 
 
-def _images(targets: Any, cameras: list[Any], background: Any) -> list[np.ndarray]:
+def pictures_of(targets: Any) -> list[Any]:
+    """Targets as a list; one alone is a list of one."""
     if getattr(targets, "ndim", None) == 3:
-        targets = [targets]
+        return [targets]
     try:
-        number = len(targets)
+        return list(targets)
     except TypeError:
         raise ValueError(f"targets must be images, not {type(targets).__name__}.") from None
+
+
+def _images(targets: list[Any], cameras: list[Any], background: Any) -> list[np.ndarray]:
+    number = len(targets)
     if number != len(cameras):
         raise ValueError(f"There are {len(cameras)} cameras, but {number} targets.")
     out = []

@@ -39,7 +39,8 @@ def load(path: Any, like: Any, settings: dict[str, Any]) -> tuple[Any, list[floa
     """
     file = Path(path)
     try:
-        with np.load(file, allow_pickle=False) as data:
+        # NumPy leaves a file open that it cannot read.
+        with open(file, "rb") as f, np.load(f, allow_pickle=False) as data:
             about = json.loads(str(data["about"]))
             losses = [float(x) for x in data["losses"]]
             stored = [data[f"leaf{k}"] for k in range(len(data.files) - 2)]
@@ -66,5 +67,4 @@ def load(path: Any, like: Any, settings: dict[str, Any]) -> tuple[Any, list[floa
             f"The checkpoint {str(file)!r} belongs to another fit: {'; '.join(differs)}. Pass what "
             "it was made with, another file, or resume=False."
         )
-    # Copied by JAX: an array that shares NumPy's memory is laid out elsewhere, but is the same.
     return structure.unflatten([jnp.array(x) for x in stored]), losses

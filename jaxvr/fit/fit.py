@@ -23,8 +23,8 @@ from jaxvr._core.checks import as_floats, require_finite, require_shape
 from jaxvr._core.status import check
 from jaxvr.adjoint import AbstractAdjoint
 from jaxvr.composite import Over
-from jaxvr.fit.batches import Batch, Views, deal, gather_views, make_batches
-from jaxvr.fit.loop import Control, run
+from jaxvr.fit.batches import Batch, Views, deal, gather_views, listed, make_batches, pictures_of
+from jaxvr.fit.loop import Control, batch_number, run
 from jaxvr.fit.losses import loss_of
 from jaxvr.fit.losses import smoothness as roughness
 from jaxvr.fit.parameters import Parameters
@@ -113,9 +113,17 @@ def fit(
         )
     begin = time.perf_counter()
     background = _background(background)
-    look = {"cache": cache, "tracer": tracer, "background": background}
-    seen = gather_views(volume, cameras, targets, **look)
-    unseen = gather_views(volume, *_pair(held_out), **look) if held_out is not None else None
+    cameras, targets = listed(cameras), pictures_of(targets)
+    number_seen = len(cameras)
+    if len(targets) != number_seen:
+        raise ValueError(f"There are {number_seen} cameras, but {len(targets)} targets.")
+    if held_out is not None:
+        more, pictures_of_them = _pair(held_out)
+        cameras, targets = cameras + listed(more), targets + pictures_of(pictures_of_them)
+    every = gather_views(
+        volume, cameras, targets, cache=cache, tracer=tracer, background=background
+    )
+    seen, unseen = every.parted(number_seen)
     dtype = seen.targets.dtype
     parameters = Parameters.of(transfer.astype(dtype), free)
     dealt = deal(seen, rays, views, seed)
@@ -128,8 +136,6 @@ def fit(
     fixed = parameters, unit, None if cache else volume, background
 
     def inputs(iteration: int) -> tuple[Any, ...]:
-        from jaxvr.fit.loop import batch_number
-
         batch = batches[batch_number(iteration, len(batches), seed)]
         now = np.asarray([w(iteration) for w in weights], dtype)
         return *fixed, batch, now
@@ -168,7 +174,12 @@ def fit(
         return views.split(flat)
 
     images = pictures(seen, batches, places)
-    others = [] if unseen is None else pictures(unseen, *make_batches(unseen, deal(unseen, None, None, 0)))
+    others: list[np.ndarray] = []
+    if unseen.pixels:
+        # In batches of the same size, which the function just compiled takes.
+        dealt = deal(unseen, len(places[0]), None, 0, fill=True)
+        least = batches[0].rays.scalar.size if cache else 0
+        others = pictures(unseen, *make_batches(unseen, dealt, least))
     numbers = {
         "control_points": fitted.positions.shape[0],
         "views": [list(s) for s in seen.shapes],
@@ -191,7 +202,7 @@ def fit(
         "loss": [number(x) for x in result.loss_history],
         "seconds": {"preparation": prepared} | timing(result),
         "fitted_views": likeness(images, seen.split(seen.targets)),
-        "held_out": [] if unseen is None else likeness(others, unseen.split(unseen.targets)),
+        "held_out": likeness(others, unseen.split(unseen.targets)) if others else [],
     }
     return FitResult(fitted, result.loss_history, images, others, result.stopped, numbers)
 

@@ -241,7 +241,9 @@ def _update_of(optimizer: Any) -> Callable[..., Any]:
 
 
 def _not_finite(iteration: int, loss: float, losses: list[float]) -> str:
-    what = "the gradient has NaN or infinite entries" if np.isfinite(loss) else f"the loss is {loss}"
+    what = (
+        "the gradient has NaN or infinite entries" if np.isfinite(loss) else f"the loss is {loss}"
+    )
     before = f" (it was {losses[-1]:.6g} before)" if losses else ""
     return (
         f"At iteration {iteration} {what}{before}. Lower the learning rate, or look at the start "

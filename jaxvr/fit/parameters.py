@@ -125,7 +125,9 @@ class Parameters:
 
     def transfer_of(self, raw: dict[str, Array]) -> TransferFunction:
         """The transfer function of raw numbers; not checked, so that it works under jit."""
-        new = {n: t.to_value(raw[n]).astype(self.transfer.dtype) for n, t in self.transforms.items()}
+        new = {
+            n: t.to_value(raw[n]).astype(self.transfer.dtype) for n, t in self.transforms.items()
+        }
         leaves = [new.get(n, getattr(self.transfer, n)) for n in FIELDS]
         return jax.tree.unflatten(jax.tree.structure(self.transfer), leaves)
 

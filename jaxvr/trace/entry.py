@@ -25,7 +25,7 @@ from jax import lax
 
 from jaxvr._core.stage import stage
 from jaxvr.trace.face import crossing, is_positive, opposite_edges
-from jaxvr.trace.scene import Scene, entry_corners, fetch
+from jaxvr.trace.scene import Scene, entry_corners, fetch, local_ids
 from jaxvr.trace.shear import ShearedRays
 from jaxvr.volume import packing
 
@@ -62,7 +62,7 @@ def build_boxes(scene: Scene) -> Boxes:
     count = scene.coordinates.shape[0] // 3
     used = scene.faces >= 0
     cell, corner = packing.cell_of(scene.faces), packing.corner_of(scene.faces)
-    ids = jnp.stack([scene.cells[4 * cell + k] for k in entry_corners(corner)])
+    ids = local_ids(scene, cell[None], entry_corners(corner))
     points = lax.stop_gradient(scene.coordinates).reshape(3, count)[:, ids]
     low = jnp.where(used[None], points.min(1), jnp.inf)
     high = jnp.where(used[None], points.max(1), -jnp.inf)
@@ -144,7 +144,7 @@ def _test(scene: Scene, rays: ShearedRays, word: Array, valid: Array):
     """Whether a ray's line crosses a boundary face inwards, and at which depth."""
     cell, corner = packing.cell_of(word), packing.corner_of(word)
     wanted = jnp.any(valid)
-    a, b, c = (fetch(scene, rays, cell, k, wanted) for k in entry_corners(corner))
+    a, b, c = fetch(scene, rays, cell, entry_corners(corner), wanted)
     edges = stage(wanted, opposite_edges, a, b, c)
     inwards = packing.flag_of(word) == 1
     contained = jnp.all(is_positive(edges) == inwards[None], 0)

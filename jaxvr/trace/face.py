@@ -53,18 +53,19 @@ def _area_jvp(primals, tangents) -> Any:
     return (area, positive), (change, np.zeros(positive.shape, jax.dtypes.float0))
 
 
-def edge(i: Array, j: Array, i_first: Array | bool) -> Array:
-    """Twice the area of (origin, i, j) (R,); its sign is right even if it is zero (-0.0 or 0.0).
+def edges(i: Array, j: Array, i_first: Array) -> Array:
+    """Twice the area of (origin, i, j) for pairs of vertices; right in sign even if zero.
 
-    i, j (5, R): vertices. i_first: whether i comes before j in the mesh's order.
+    i, j (2, E, R): projected coordinates. i_first (E, R): whether i comes before j in the mesh's
+    order. Returns (E, R); zeros are signed, see `is_positive`.
     """
-    area, positive = _area(i[X], i[Y], j[X], j[Y], jnp.broadcast_to(i_first, i[X].shape))
+    area, positive = _area(*i, *j, jnp.broadcast_to(i_first, i.shape[1:]))
     # The area has the right sign already unless it is zero.
     return jnp.where(area == 0, jnp.where(positive, area + 0.0, -0.0 * (area + 1)), area)
 
 
 def is_positive(area: Array) -> Array:
-    """Sign of an `edge`, which has one even at zero."""
+    """Sign of `edges`, which has one even at zero."""
     return ~jnp.signbit(area)
 
 
@@ -74,7 +75,8 @@ def opposite_edges(a: Array, b: Array, c: Array) -> Array:
     The ray passes inside if their signs agree; then their sizes are the barycentric weights of
     a, b and c, unnormalised.
     """
-    return jnp.stack([edge(b, c, True), edge(c, a, False), edge(a, b, True)])
+    start, end = (jnp.stack([v[: Y + 1] for v in face], 1) for face in ((b, c, a), (c, a, b)))
+    return edges(start, end, jnp.array([[True], [False], [True]]))
 
 
 def _on_edge(face: Face) -> Array:

@@ -37,7 +37,7 @@ from jaxvr.trace.face import (
     barycentric,
     choose,
     crossing_at,
-    edge,
+    edges,
     is_positive,
 )
 from jaxvr.trace.scene import Scene, entry_corners, local_ids, value_slots
@@ -78,7 +78,9 @@ def exit_sizes(weights: Array, to_apex: Array, drop: Array) -> Array:
 
 def edges_to_apex(face: Face, apex: Array, corner: Array) -> Array:
     """The edges (a, d), (b, d), (c, d), (3, R); the apex stands at `corner` in the order."""
-    return jnp.stack([edge(v, apex, corner > k) for k, v in enumerate(face)])
+    start = jnp.stack([v[: Y + 1] for v in face], 1)
+    end = jnp.broadcast_to(apex[: Y + 1, None], start.shape)
+    return edges(start, end, corner[None] > jnp.arange(3)[:, None])
 
 
 def exit_face(face: Face, apex: Array, drop: Array) -> Face:
@@ -186,12 +188,12 @@ def pull_back_cell(
         apex,
     )
     shares = list(zip((*share, none), exit_share, strict=True))
-    corners = (*entry_corners(corner), corner)
-    ids = stage(wanted, lambda: tuple(local_ids(scene, number, k) for k in corners))
+    corners = jnp.concatenate([entry_corners(corner), corner[None]])
+    ids = stage(wanted, local_ids, scene, number[None], corners)
     if values is not None:
-        slots = [value_slots(scene, number, *at) for at in zip(corners, ids, strict=True)]
+        slots = value_slots(scene, number[None], corners, ids)
         bars = [i * q.s + o * p.s for i, o in shares]
-        values = values.at[jnp.concatenate(slots)].add(jnp.concatenate(bars))
+        values = values.at[slots].add(jnp.stack(bars))
 
     def in_space(v: _Pulled) -> tuple[Array, Array, Array]:
         return v.x, v.y, rays.sign * v.z - rays.shear_x * v.x - rays.shear_y * v.y

@@ -89,26 +89,33 @@ def value_slots(scene: Scene, cell: Array, corner: Array, point: Array) -> Array
     """Index into `values` of the scalar at a corner of a cell."""
     if scene.location == "point":
         return point
-    return cell if scene.location == "cell" else 4 * cell + corner
+    return cell + 0 * corner if scene.location == "cell" else 4 * cell + corner
 
 
-def fetch(scene: Scene, rays: ShearedRays, cell: Array, corner: Array, wanted: Array) -> Array:
-    """The vertex (5, R) at a local corner of a cell, as each ray sees it; see `shear`.
+def fetch(
+    scene: Scene, rays: ShearedRays, cell: Array, corners: Array, wanted: Array
+) -> tuple[Array, ...]:
+    """The vertices (5, R) at local corners (C, R) of a cell (R,), as each ray sees them.
 
-    wanted (): whether any ray needs it.
+    wanted (): whether any ray needs them.
     """
     count = scene.coordinates.shape[0] // 3
-    axes = (rays.axis_x, rays.axis_y, rays.axis_z)
 
-    def load(scene, axes, cell, corner):
-        point = local_ids(scene, cell, corner)
-        at = [scene.coordinates[axis * count + point] for axis in axes]
-        return *at, scene.values[value_slots(scene, cell, corner, point)]
+    def load(scene, rays, cell, corners):
+        point = local_ids(scene, cell[None], corners)
+        axes = (rays.axis_x, rays.axis_y, rays.axis_z)
+        at = [scene.coordinates[axis[None] * count + point] for axis in axes]
+        return *at, scene.values[value_slots(scene, cell[None], corners, point)]
 
-    *point, value = stage(wanted, load, scene, axes, cell, corner)
-    return jnp.stack([*stage(wanted, shear_points, rays, *point), value])
+    def project(rays, *point):
+        return shear_points(jax.tree.map(lambda x: x[None], rays), *point)
+
+    *point, value = stage(wanted, load, scene, rays, cell, corners)
+    rows = (*stage(wanted, project, rays, *point), value)
+    return tuple(jnp.stack([row[k] for row in rows]) for k in range(corners.shape[0]))
 
 
-def entry_corners(corner: Array) -> tuple[Array, Array, Array]:
-    """Local indices, ascending, of the three vertices of the face opposite `corner`."""
-    return tuple(k + (corner <= k).astype(jnp.int32) for k in range(3))  # type: ignore
+def entry_corners(corner: Array) -> Array:
+    """Local indices (3, R), ascending, of the vertices of the face opposite `corner` (R,)."""
+    k = jnp.arange(3, dtype=jnp.int32)[:, None]
+    return k + (corner[None] <= k).astype(jnp.int32)

@@ -110,7 +110,7 @@ def test_gradients_with_respect_to_everything():
         return jnp.sum(rgb * jnp.arange(1.0, 10.0).reshape(3, 3)) + jnp.sum(jnp.sin(depth))
 
     args = (jnp.array(0.0), TF.colors, TF.extinctions, *segment)
-    check_grads(loss, args, order=1, modes=["fwd", "rev"], rtol=1e-6, atol=1e-6)
+    check_grads(loss, args, order=1, modes=["fwd", "rev"], rtol=1e-6, atol=1e-6, eps=1e-6)
 
 
 def test_constant_scalars_have_finite_gradients_in_both_precisions(dtype):

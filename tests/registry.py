@@ -1,0 +1,81 @@
+"""Every tracer, integrator, adjoint and kind of mesh, named once; the tests cross them all.
+
+A new implementation is one line here, with what it can do. `combinations` leaves out what a flag
+rules out, and nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+import jaxvr
+from jaxvr.volume import datasets
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """name, what makes it, and flags; `exact` means equal to `Analytic` to rounding."""
+
+    name: str
+    make: Callable[[], Any]
+    exact: bool = True
+    forward: bool = True
+    reverse: bool = True
+
+
+TRACERS = [Entry("RayCast", jaxvr.RayCast)]
+
+INTEGRATORS = [
+    Entry("Analytic", jaxvr.Analytic),
+    Entry("Quadrature", lambda: jaxvr.Quadrature(16)),
+]
+
+ADJOINTS = [
+    Entry("Replay", jaxvr.Replay, forward=False),
+    Entry("Direct", lambda: jaxvr.Direct(max_steps=64)),
+    Entry("Forward", jaxvr.Forward, reverse=False),
+]
+
+
+def _box(location: str, dtype: str):
+    mesh = datasets.box((2, 2, 2), jitter=0.2, seed=1, dtype=dtype, shuffle=True)
+    rng = np.random.default_rng(5)
+    if location == "cell":
+        return mesh.replace(values=rng.uniform(0, 1, mesh.n_tets), location="cell")
+    if location == "corner":
+        return mesh.replace(values=rng.uniform(0, 1, (mesh.n_tets, 4)), location="corner")
+    return mesh
+
+
+MESHES = ["point", "cell", "corner"]
+
+
+def mesh_of(location: str, dtype: str):
+    return _box(location, dtype)
+
+
+def transfer_of(dtype: str) -> jaxvr.TransferFunction:
+    """Six control points with a jump, over values from 0 to 1."""
+    rng = np.random.default_rng(2)
+    positions = np.array([0.05, 0.3, 0.45, 0.45, 0.7, 0.9])
+    return jaxvr.TransferFunction(
+        positions, rng.uniform(0, 1, (6, 3)), rng.uniform(0.2, 3, 6), dtype=dtype
+    )
+
+
+def camera_of(dtype: str) -> jaxvr.Camera:
+    return jaxvr.Camera.look_at(
+        (1.9, 1.4, 2.3), (0.52, 0.47, 0.5), fov=32.0, width=6, height=5, dtype=dtype
+    )
+
+
+def combinations() -> Iterator[tuple[Entry, Entry, Entry, str]]:
+    for tracer in TRACERS:
+        for integrator in INTEGRATORS:
+            for adjoint in ADJOINTS:
+                for mesh in MESHES:
+                    yield tracer, integrator, adjoint, mesh

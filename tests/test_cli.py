@@ -1,0 +1,143 @@
+"""The command line: what it writes, and that errors are one line and exit code 2."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+import jaxvr
+from jaxvr.cli import main
+
+
+@pytest.fixture(scope="module")
+def mesh(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mesh") / "box.vtu"
+    jaxvr.write_mesh(path, jaxvr.datasets.box((2, 2, 2), dtype="float32"))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def tf(tmp_path_factory):
+    path = tmp_path_factory.mktemp("tf") / "tf.json"
+    x = np.linspace(0, 1, 6)
+    jaxvr.TransferFunction.from_colormap("turbo", x, [1, 4, 0, 6, 1, 8]).to_json(path)
+    return str(path)
+
+
+SMALL = ["--width", "12", "--height", "12"]
+
+
+def test_info(mesh, capsys):
+    assert main(["info", mesh]) == 0
+    out = capsys.readouterr().out
+    assert "values (point)" in out and "48 tetrahedra" in out
+
+
+def test_info_plot3d(data_path, capsys):
+    folder = data_path("plot3d")
+    grid = next(p for p in sorted(folder.iterdir()) if "xyz" in p.name)
+    assert main(["info", str(grid), "--field", "y"]) == 0
+    assert "224," in capsys.readouterr().out
+
+
+def test_render_png_is_transparent_and_npy_is_exact(mesh, tf, tmp_path, capsys):
+    for name in ("a.png", "a.npy"):
+        assert main(["render", mesh, "--tf", tf, "-o", str(tmp_path / name), *SMALL]) == 0
+    image = np.load(tmp_path / "a.npy")
+    volume = jaxvr.read_mesh(mesh)
+    camera = jaxvr.Camera.orbit(volume, width=12, height=12)
+    want = jaxvr.render(volume, camera, jaxvr.TransferFunction.from_json(tf))
+    np.testing.assert_allclose(image, want, atol=1e-6)
+    png = matplotlib.image.imread(tmp_path / "a.png")
+    assert png.shape == (12, 12, 4) and png[0, 0, 3] == 0
+    np.testing.assert_allclose(png[..., 3], image[..., 3], atol=0.51 / 255)
+    assert "a.png" in capsys.readouterr().out
+
+
+def test_render_colormap_on_a_background(mesh, tmp_path):
+    out = str(tmp_path / "b.npy")
+    arguments = ["--background", "1", "0.5", "0", "--opacity", "2", "--azimuth", "-40"]
+    assert main(["render", mesh, "-o", out, *SMALL, *arguments]) == 0
+    image = np.load(out)
+    np.testing.assert_allclose(image[0, 0], [1, 0.5, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(image[..., 3], 1, atol=1e-6)
+
+
+def test_fit(mesh, tf, tmp_path, capsys):
+    out = tmp_path / "fit"
+    arguments = ["--points", "6", "--views", "2", "--iterations", "60", "--size", "12", "--quiet"]
+    assert main(["fit", mesh, "--reference-tf", tf, "-o", str(out), *arguments]) == 0
+    assert "PSNR" in capsys.readouterr().out
+    report = json.loads((out / "report.json").read_text())
+    assert report["held_out"][0]["psnr"] > 20
+    for name in ("target", "start", "fitted", "difference", "transfer", "overview"):
+        assert (out / f"{name}.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["render", "MESH", "-o", "OUT/a.png", "--tf", "virids"], "Did you mean viridis"),
+        (["render", "MESH", "-o", "OUT/a.png", "--tf", "no.json"], "no file 'no.json'"),
+        (["render", "MESH", "-o", "OUT/a.png", "--tf", "MESH/x.json"], "There is no file"),
+        (["render", "MESH", "-o", "OUT/a.jpg"], ".png or .npy"),
+        (["render", "MESH", "-o", "OUT/none/a.png"], "There is no folder"),
+        (["render", "MESH", "-o", "OUT/a.png", "--field", "heat"], "no field 'heat'"),
+        (["render", "MESH", "-o", "OUT/a.png", "--zoom", "0"], "zoom"),
+        (["render", "MESH", "-o", "OUT/a.png", "--width", "0"], "width"),
+        (["render", "MESH", "-o", "OUT/a.png", "--opacity", "-1"], "not be negative"),
+        (["render", "MESH", "-o", "OUT/a.png", "--width", "x"], "invalid int value"),
+        (["render", "MESH"], "required"),
+        (["render", "nowhere.vtu", "-o", "OUT/a.png"], "nowhere.vtu"),
+        (["info", "OUT"], "folder"),
+        (["info", "OUT/junk.vtu"], "junk.vtu"),
+        (["info", "OUT/junk.bin"], "junk.bin"),
+        (["fit", "MESH", "--reference-tf", "viridis", "-o", "OUT/f", "--points", "1"], "points"),
+        (["fit", "MESH", "--reference-tf", "viridis", "-o", "OUT/f", "--views", "0"], "n must"),
+        (["draw"], "invalid choice"),
+        ([], "required"),
+    ],
+)
+def test_errors_are_one_line(arguments, message, mesh, tmp_path, capsys):
+    (tmp_path / "junk.vtu").write_text("<VTKFile")
+    (tmp_path / "junk.bin").write_bytes(b"abc")
+    arguments = [a.replace("MESH", mesh).replace("OUT", str(tmp_path)) for a in arguments]
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("jaxvr: error: ") and message in lines[0]
+    assert captured.out == ""
+
+
+def test_warnings_are_one_line(mesh, tf, tmp_path, capsys):
+    far = tmp_path / "far.json"
+    jaxvr.TransferFunction([50.0, 60.0], np.ones((2, 3)), [1.0, 2.0]).to_json(far)
+    assert main(["render", mesh, "--tf", str(far), "-o", str(tmp_path / "a.npy"), *SMALL]) == 0
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("jaxvr: warning: The transfer function spans")
+
+
+@pytest.mark.parametrize("command", [[], ["info"], ["render"], ["fit"]])
+def test_help(command, capsys):
+    assert main([*command, "--help"]) == 0
+    assert "usage: jaxvr" in capsys.readouterr().out
+
+
+def test_python_m_jaxvr_as_users_run_it(mesh, tmp_path):
+    """In a process of its own, without x64: no warning either."""
+    out = tmp_path / "a.npy"
+
+    def run(*arguments):
+        command = [sys.executable, "-m", "jaxvr", *arguments]
+        return subprocess.run(command, capture_output=True, text=True)
+
+    done = run("render", mesh, "-o", str(out), *SMALL)
+    assert (done.returncode, done.stderr) == (0, "") and np.load(out).dtype == np.float32
+    done = run("info", "nowhere.vtu")
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.strip().splitlines() == ["jaxvr: error: There is no file 'nowhere.vtu'."]
