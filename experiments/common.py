@@ -45,7 +45,7 @@ def shells(
     density = floor + sum(h * np.exp(-(((t - c) / w) ** 2)) for c, w, h in peaks)
     positions = values.min() + (values.max() - values.min()) * t
     dtype = volume.points.dtype
-    extinctions = (depth / diagonal(volume) * density).astype(dtype)
+    extinctions = np.asarray(depth / diagonal(volume) * density, dtype)
     return jaxvr.TransferFunction.from_colormap(colormap, positions, extinctions, dtype=dtype)
 
 

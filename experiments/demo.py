@@ -75,7 +75,7 @@ def run(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("output/demo"))
     parser.add_argument("--tiny", action="store_true", help="a few pixels and iterations")
     arguments = parser.parse_args()

@@ -99,8 +99,8 @@ def recover(arguments: Any) -> None:
     look = {"background": arguments.background}
     targets = [np.asarray(render(mesh, c, reference, **look)) for c in cameras]
     unseen = np.asarray(render(mesh, held_out, reference, **look))
-    ends = np.asarray(reference.positions)[[0, -1]]
-    positions = np.linspace(*ends, arguments.points).astype(mesh.dtype)
+    first, last = (float(reference.positions[k]) for k in (0, -1))
+    positions = np.linspace(first, last, arguments.points).astype(mesh.dtype)
     start = noise(positions, _typical(reference, mesh), arguments.seed)
     result = fit(
         start,

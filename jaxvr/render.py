@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxvr._core.checks import as_floats, is_concrete, require_finite
 from jaxvr._core.status import check
@@ -27,11 +28,14 @@ from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
 from jaxvr.trace import AbstractTracer, RayCast, Recorded, Segments
 from jaxvr.trace.recorded import fill, record
 from jaxvr.view.camera import Camera
+from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
 
-# Rays in one batch: enough to hide the cost of starting a kernel, few enough to stay in cache.
-BATCH = 512
+# Rays of a tile, rows and columns of pixels, and so of a batch: enough to hide the cost of
+# starting a kernel, few enough that they take about as many steps and their state stays in cache.
+TILE = (16, 32)
+BATCH = TILE[0] * TILE[1]
 
 
 def render(
@@ -67,7 +71,7 @@ def render(
     `jaxvr.optics.partition` and the adjoints.
     """
     pipeline = Pipeline(tracer or RayCast(), integrator or Analytic(), compositor or Over())
-    camera = _camera_of(camera, volume)
+    camera = _camera_of(camera, _volume_of(volume))
     transfer = _transfer_of(transfer, volume)
     image, status = _render(
         pipeline, adjoint or Replay(), volume, camera, transfer, _background(background)
@@ -104,7 +108,7 @@ def render_rays(
       directions too.
     """
     pipeline = Pipeline(tracer or RayCast(), integrator or Analytic(), compositor or Over())
-    origins, directions = _rays_of(origins, directions, volume)
+    origins, directions = _rays_of(origins, directions, _volume_of(volume))
     transfer = _transfer_of(transfer, volume)
     rgba, bits = _render_rays(
         *(pipeline, adjoint or Replay(), volume, origins, directions, transfer),
@@ -136,10 +140,10 @@ def trace(
             "trace cannot run inside jit or grad, since the number of segments decides the shape "
             "of its result. Call it outside and pass its result in, or use render."
         )
-    tracer = tracer or RayCast()
+    tracer, volume = tracer or RayCast(), _volume_of(volume)
     if isinstance(camera, Camera):
         camera = _camera_of(camera, volume)
-        shape, order = (camera.height, camera.width), _tiles(camera.height, camera.width)
+        shape, order = (camera.height, camera.width), _tile_order(camera.height, camera.width)
         origins, directions = (x.reshape(-1, 3)[order] for x in camera.rays())
     else:
         origins, directions = _rays_of(*camera, volume)
@@ -193,17 +197,19 @@ def shade(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _render(pipeline, adjoint, volume, camera, transfer, background):
+    # Under a user's own jit the operands may be constants: XLA must not compute with them itself.
+    volume, camera = lax.optimization_barrier((volume, camera))
     height, width = camera.height, camera.width
-    order = _tiles(height, width)
-    origins, directions = (x.reshape(-1, 3)[order] for x in camera.rays())
+    origins, directions = (_tile(x) for x in camera.rays())
     rgba, status = _run(pipeline, adjoint, volume, origins, directions, transfer)
-    rgba = _over(_untile(rgba, order), background)
-    return rgba.reshape(height, width, 4), _untile(status, order).reshape(height, width)
+    rgba = _over(_untile(rgba, height, width), background)
+    return rgba, _untile(status[:, None], height, width)[..., 0]
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _render_rays(pipeline, adjoint, volume, origins, directions, transfer, background):
     shape = origins.shape[:-1]
+    volume, origins, directions = lax.optimization_barrier((volume, origins, directions))
     rgba, status = _run(
         pipeline, adjoint, volume, origins.reshape(-1, 3), directions.reshape(-1, 3), transfer
     )
@@ -263,26 +269,34 @@ def _batches(arrays: Any) -> tuple[Any, int]:
     return tuple(split(x) for x in arrays), count
 
 
-def _tiles(height: int, width: int) -> np.ndarray:
-    """Pixel numbers along a Morton curve: neighbours in the list are neighbours in the image."""
+def _tile(x: Array) -> Array:
+    """An image (height, width, C) as rays (R, C), tile after tile, with its rim repeated to fill
+    the last ones. Reshapes and transposes only: their derivatives are the same."""
+    (rows, columns), (height, width, channels) = TILE, x.shape
+    x = jnp.pad(x, ((0, -height % rows), (0, -width % columns), (0, 0)), mode="edge")
+    x = x.reshape(x.shape[0] // rows, rows, x.shape[1] // columns, columns, channels)
+    return x.transpose(0, 2, 1, 3, 4).reshape(-1, channels)
+
+
+def _untile(x: Array, height: int, width: int) -> Array:
+    """Back from `_tile`: (R, C) to (height, width, C)."""
+    rows, columns = TILE
+    x = x.reshape(-(-height // rows), -(-width // columns), rows, columns, x.shape[-1])
+    x = x.transpose(0, 2, 1, 3, 4)
+    return x.reshape(x.shape[0] * rows, -1, x.shape[-1])[:height, :width]
+
+
+def _tile_order(height: int, width: int) -> np.ndarray:
+    """Pixel numbers (height * width,), tile after tile."""
     rows, columns = (x.ravel() for x in np.mgrid[0:height, 0:width])
-    key = np.zeros(rows.size, np.int64)
-    for bit in range(max(height, width).bit_length()):
-        key |= ((rows >> bit & 1) << (2 * bit + 1)) | ((columns >> bit & 1) << (2 * bit))
-    return np.argsort(key, kind="stable").astype(np.int32)
-
-
-def _untile(x: Array, order: np.ndarray) -> Array:
-    inverse = np.empty_like(order)
-    inverse[order] = np.arange(order.size, dtype=order.dtype)
-    return x[inverse]
+    return np.lexsort((columns, rows, columns // TILE[1], rows // TILE[0])).astype(np.int32)
 
 
 def _over(rgba: Array, background: Array | None) -> Array:
     if background is None:
         return rgba
     behind = jnp.concatenate([background.astype(rgba.dtype), jnp.ones(1, rgba.dtype)])
-    return rgba + (1 - rgba[..., 3:]) * behind[None]
+    return rgba + (1 - rgba[..., 3:]) * behind.reshape((1,) * (rgba.ndim - 1) + (4,))
 
 
 def _background(background: Any) -> Any:
@@ -301,6 +315,15 @@ def _dtype_of(volume: Any) -> Any:
 
 def _cast(tree: Any, dtype: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), tree)
+
+
+def _volume_of(volume: Any) -> TetMesh:
+    if not isinstance(volume, TetMesh):
+        raise ValueError(
+            f"volume must be a jaxvr.TetMesh, but is a {type(volume).__name__}. "
+            "Read files with jaxvr.read_mesh."
+        )
+    return volume
 
 
 def _camera_of(camera: Any, volume: Any) -> Camera:

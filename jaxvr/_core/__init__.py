@@ -1,1 +1,4 @@
-"""What every other room stands on: pytrees, checks of arguments, status bits. No idea of rendering."""
+"""What every other room stands on: pytrees, checks of arguments, stages, status bits.
+
+No idea of rendering.
+"""

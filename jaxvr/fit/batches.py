@@ -99,11 +99,11 @@ def gather_views(
     traced = [isinstance(c, Segments) for c in cameras]
     if any(traced) and not cache:
         raise ValueError("cache=False renders anew, but some of the cameras are Segments.")
-    if volume is None and not all(traced):
-        raise ValueError("volume is None, but not all of the cameras are Segments.")
     if all(traced):
         parts = [(c, np.asarray(c.order)) for c in cameras]
         dtype = np.asarray(cameras[0].scalar).dtype
+    elif volume is None:
+        raise ValueError("volume is None, but not all of the cameras are Segments.")
     else:
         dtype = np.dtype(volume.points.dtype)
         if not cache:
@@ -142,8 +142,8 @@ def _trace(volume: Any, cameras: list[Any], tracer: Any, dtype: Any) -> Iterator
         if isinstance(after, Camera) and pixels <= _TOGETHER:
             continue
         tiles = np.argsort(_tile_rank([_shape(g) for g in group]))
-        rays = tuple(x[tiles] for x in _rays(group, dtype))
-        part = trace(volume, rays, tracer=tracer)
+        origins, directions = _rays(group, dtype)
+        part = trace(volume, (origins[tiles], directions[tiles]), tracer=tracer)
         yield part, tiles[np.asarray(part.order)]
         group = []
 
@@ -278,7 +278,10 @@ def listed(cameras: Any) -> list[Any]:
 
 
 def _shape(camera: Any) -> tuple[int, int]:
-    return camera.shape if isinstance(camera, Segments) else (camera.height, camera.width)
+    if isinstance(camera, Camera):
+        return camera.height, camera.width
+    height, width = camera.shape
+    return height, width
 
 
 def pictures_of(targets: Any) -> list[Any]:

@@ -25,7 +25,7 @@ def save(path: Any, state: Any, losses: list[float], settings: dict[str, Any]) -
     file.parent.mkdir(parents=True, exist_ok=True)
     leaves, structure = jax.tree.flatten(state)
     about = {"format": _FORMAT, "structure": str(structure), "settings": settings}
-    arrays = {f"leaf{k}": np.asarray(x) for k, x in enumerate(leaves)}
+    arrays: dict[str, Any] = {f"leaf{k}": np.asarray(x) for k, x in enumerate(leaves)}
     beside = file.with_name(file.name + ".part")
     with open(beside, "wb") as f:
         np.savez(f, about=json.dumps(about), losses=np.asarray(losses, np.float64), **arrays)

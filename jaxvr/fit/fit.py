@@ -239,7 +239,10 @@ def _see(
     }
     if isinstance(rays, Segments):
         return shade(rays, transfer, **nouns), jnp.zeros((), jnp.int32)
-    return render_rays(volume, *rays, transfer, tracer=objective.tracer, status=True, **nouns)
+    origins, directions = rays
+    return render_rays(
+        volume, origins, directions, transfer, tracer=objective.tracer, status=True, **nouns
+    )
 
 
 _predict = functools.partial(jax.jit, static_argnums=0)(_see)
@@ -292,7 +295,8 @@ def _schedule(name: str, weight: Any) -> Callable[[int], float]:
         return lambda i: float(weight(i))
     if not (isinstance(weight, int | float | np.number) and 0 <= weight < np.inf):
         raise ValueError(f"{name} must be a number >= 0 or a schedule, but is {weight!r}.")
-    return lambda i: float(weight)
+    number = float(weight)  # type: ignore[arg-type]
+    return lambda i: number
 
 
 def _name(x: Any) -> Any:

@@ -7,7 +7,7 @@ rendering", 2021): the mean squared difference of neighbouring colours, 0.4 time
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +36,8 @@ LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2}
 
 def loss_of(loss: Any) -> Loss:
     """The loss of a name, or the function itself."""
-    if callable(loss):
-        return loss
+    if not isinstance(loss, str) and callable(loss):
+        return cast(Loss, loss)
     if loss not in LOSSES:
         raise ValueError(f"loss must be one of {sorted(LOSSES)} or a function, but is {loss!r}.")
     return LOSSES[loss]

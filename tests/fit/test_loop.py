@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,7 +64,7 @@ def test_batches_and_resume_to_the_bit(tmp_path):
     def loss(p, batch):
         return jnp.sum(jnp.abs(p["x"] - batch) ** 1.5)
 
-    keywords = {"batches": batches, "seed": 3, "checkpoint_every": 4}
+    keywords: dict[str, Any] = {"batches": batches, "seed": 3, "checkpoint_every": 4}
     whole = fit_parameters(loss, START, iterations=10, **keywords)
     path = tmp_path / "c.npz"
     fit_parameters(loss, START, iterations=5, checkpoint=path, **keywords)
@@ -73,8 +75,9 @@ def test_batches_and_resume_to_the_bit(tmp_path):
     again = fit_parameters(loss, START, iterations=10, checkpoint=path, resume=True, **keywords)
     assert len(again.seconds) == 0
     np.testing.assert_array_equal(whole.parameters["x"], again.parameters["x"])
+    keywords["seed"] = 4
     with pytest.raises(ValueError, match="seed was 3 and is 4"):
-        fit_parameters(loss, START, checkpoint=path, resume=True, **(keywords | {"seed": 4}))
+        fit_parameters(loss, START, checkpoint=path, resume=True, **keywords)
 
 
 def test_not_finite_names_the_iteration():
