@@ -18,7 +18,7 @@ demo: $(VENV)/.package
 	$(BIN)/python -m experiments.demo --out output/demo
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadscope
 
 lint: $(VENV)/.tools
 	$(BIN)/ruff check .

@@ -49,7 +49,7 @@ def shells(
     return jaxvr.TransferFunction.from_colormap(colormap, positions, extinctions, dtype=dtype)
 
 
-def write_json(path: Any, data: dict[str, Any]) -> Path:
+def write_json(path: Any, data: Any) -> Path:
     file = Path(path)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(data, indent=2) + "\n")

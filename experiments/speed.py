@@ -13,6 +13,7 @@ correct scalars for perspective, so both cameras are orthographic and VTK's is h
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import time
 from collections.abc import Callable
@@ -49,13 +50,16 @@ def camera_of(mesh: jaxvr.TetMesh, size: int) -> jaxvr.Camera:
     )
 
 
+def _vtk() -> tuple[Any, Any]:
+    """VTK and its NumPy bridge, which only this experiment needs (extra `peers`)."""
+    return importlib.import_module("vtk"), importlib.import_module("vtk.util.numpy_support")
+
+
 class Vtk:
     """VTK's ray caster on the same scene; `render` returns uint8 RGBA, row 0 on top."""
 
     def __init__(self, mesh, camera, transfer, threads: int):
-        import vtk
-        from vtk.util import numpy_support
-
+        vtk, numpy_support = _vtk()
         points, tets = np.asarray(mesh.points, float), _positive(mesh)
         grid, coordinates, cells = vtk.vtkUnstructuredGrid(), vtk.vtkPoints(), vtk.vtkCellArray()
         coordinates.SetData(numpy_support.numpy_to_vtk(points, deep=1))
@@ -114,9 +118,7 @@ class Vtk:
         self.window.Render()
 
     def image(self) -> np.ndarray:
-        import vtk
-        from vtk.util import numpy_support
-
+        vtk, numpy_support = _vtk()
         grab = vtk.vtkWindowToImageFilter()
         grab.SetInput(self.window)
         grab.SetInputBufferTypeToRGBA()

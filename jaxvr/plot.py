@@ -151,7 +151,7 @@ def plot_transfer(
             level = (top * (1.02 + 0.07 * k), top * (1.08 + 0.07 * k))
             ax.imshow(_strip(f, lo, hi), extent=(lo, hi, *level), aspect="auto")
         top *= 1.17
-        ax.legend(fontsize="small", loc="center right")
+        ax.legend(fontsize="small", loc="best")
     ax.set_xlim(lo, hi)
     ax.set_ylim(0, top)
     ax.set_xlabel("scalar")

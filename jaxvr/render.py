@@ -158,8 +158,9 @@ def trace(
     start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     if start[-1] >= 2**31:
         raise ValueError(f"{start[-1]} nodes do not fit 32-bit indices. Trace fewer rays at once.")
-    # Buffers are as long as the next multiple, so that similar views share a compiled function.
-    total = -(-max(int(start[-1]), 1) // (1 << 16)) << 16
+    # Buffers are rounded up to three leading bits, so that similar views share compiled functions.
+    unit = 1 << max(int(start[-1]).bit_length() - 3, 10)
+    total = -(-max(int(start[-1]), 1) // unit) * unit
     nodes, segments = _fill(tracer, volume, origins, directions, start[:-1].astype(np.int32), total)
     return Segments(
         nodes.scalar,
@@ -168,7 +169,6 @@ def trace(
         jnp.asarray(status),
         jnp.asarray(order, jnp.int32),
         shape=tuple(shape),
-        count=int(start[-1]),
     )
 
 

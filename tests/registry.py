@@ -74,8 +74,11 @@ def camera_of(dtype: str) -> jaxvr.Camera:
 
 
 def combinations() -> Iterator[tuple[Entry, Entry, Entry, str]]:
+    """All with all on point data, and all tracers and adjoints on the other kinds of field, which
+    integrators do not see."""
     for tracer in TRACERS:
-        for integrator in INTEGRATORS:
-            for adjoint in ADJOINTS:
-                for mesh in MESHES:
-                    yield tracer, integrator, adjoint, mesh
+        for adjoint in ADJOINTS:
+            for integrator in INTEGRATORS:
+                yield tracer, integrator, adjoint, "point"
+            for mesh in MESHES[1:]:
+                yield tracer, INTEGRATORS[0], adjoint, mesh

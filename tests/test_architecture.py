@@ -12,7 +12,8 @@ import jaxvr
 ROOT = Path(jaxvr.__file__).parent
 ROOMS = [
     "_core", "numerics", "volume", "view", "optics", "order", "trace", "composite", "adjoint",
-    "render", "fit", "shard", "plot", "cli", "__main__",
+    "render", "fit", "shard", "plot",
+    "pictures", "cli", "__main__",
 ]  # fmt: skip
 FILES = sorted(p.relative_to(ROOT) for p in ROOT.rglob("*.py") if p.name != "__init__.py")
 
@@ -67,8 +68,10 @@ def _is_mpl(node) -> bool:
     return isinstance(node, ast.ImportFrom) and (node.module or "").startswith("matplotlib")
 
 
-PUBLIC = """TetMesh read_mesh write_mesh read_plot3d Camera TransferFunction render render_rays trace
-shade fit psnr ssim datasets Analytic Quadrature RayCast Over Replay Direct Forward check""".split()
+PUBLIC = """
+TetMesh read_mesh write_mesh read_plot3d Camera TransferFunction render render_rays trace
+shade fit psnr ssim datasets Analytic Quadrature RayCast Over Replay Direct Forward check
+""".split()
 
 
 def test_public_names():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -118,8 +119,8 @@ def test_chords_of_traced_segments_are_world_lengths(scene):
 
 def test_new_floats_do_not_compile_again(scene):
     mesh, camera, transfer = scene
-    module = sys.modules["jaxvr.render"]
-    gradient = jax.jit(jax.grad(lambda t, m, c: jnp.sum(jaxvr.render(m, c, t) ** 2)))
+    module: Any = sys.modules["jaxvr.render"]
+    gradient: Any = jax.jit(jax.grad(lambda t, m, c: jnp.sum(jaxvr.render(m, c, t) ** 2)))
     jaxvr.render(mesh, camera, transfer)
     gradient(transfer, mesh, camera)
     before = module._render._cache_size(), gradient._cache_size()
@@ -155,7 +156,8 @@ def test_vmap_over_transfer_functions(scene):
 def test_points_that_are_not_finite_are_an_error_not_a_picture(scene):
     mesh, camera, transfer = scene
     broken = dataclasses.replace(mesh, points=mesh.points * jnp.nan)
-    image, bits = jaxvr.render_rays(broken, *camera.rays(), transfer, status=True)
+    origins, directions = camera.rays()
+    image, bits = jaxvr.render_rays(broken, origins, directions, transfer, status=True)
     # Nothing contains a ray: no wrong picture, and it ends.
     assert (image == 0).all()
     with pytest.raises(ValueError, match="points"):
@@ -164,12 +166,13 @@ def test_points_that_are_not_finite_are_an_error_not_a_picture(scene):
 
 def test_bad_arguments(scene):
     mesh, camera, transfer = scene
+    word: Any = "front"
     with pytest.raises(ValueError, match=r"camera must be a jaxvr.Camera, but is a str"):
-        jaxvr.render(mesh, "front", transfer)
+        jaxvr.render(mesh, word, transfer)
     with pytest.raises(ValueError, match=r"transfer must be a jaxvr.TransferFunction"):
-        jaxvr.render(mesh, camera, "viridis")
+        jaxvr.render(mesh, camera, word)
     with pytest.raises(ValueError, match=r"volume must be a jaxvr.TetMesh"):
-        jaxvr.render("mesh.vtu", camera, transfer)
+        jaxvr.render(word, camera, transfer)
     with pytest.raises(ValueError, match=r"background must be RGB with shape \(3,\)"):
         jaxvr.render(mesh, camera, transfer, background=np.array([1.0]))
     with pytest.raises(ValueError, match=r"direction.s. are zero, the first at \(1,\)"):

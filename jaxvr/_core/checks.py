@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -31,6 +32,18 @@ def float_dtype(dtype: Any) -> np.dtype:
     if d == np.float64 and default_float() == np.float64:
         return d
     return np.dtype(np.float32) if d.kind == "f" else default_float()
+
+
+def common_float(dtype: Any, *arrays: Any) -> np.dtype:
+    """The dtype asked for, else the widest float among the arrays, else JAX's default."""
+    if dtype is not None:
+        return float_dtype(dtype)
+    floats = [
+        float_dtype(a.dtype)
+        for a in arrays
+        if hasattr(a, "dtype") and jnp.issubdtype(a.dtype, jnp.floating)
+    ]
+    return max(floats, key=lambda d: d.itemsize, default=default_float())
 
 
 def as_floats(name: str, x: Any, *, ndim: int | None = None, dtype: Any = None) -> Any:

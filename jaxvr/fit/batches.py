@@ -232,7 +232,6 @@ def _runs(views: Views, pixels: np.ndarray, total: int) -> Segments:
         status=jnp.zeros(rays, jnp.int32),
         order=jnp.arange(rays, dtype=jnp.int32),
         shape=(rays,),
-        count=total,  # the same for all, since it is part of what is compiled for
     )
 
 

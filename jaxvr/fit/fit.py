@@ -292,11 +292,12 @@ def _weights(colors: Any, extinctions: Any) -> list[tuple[str, Any]]:
 
 def _schedule(name: str, weight: Any) -> Callable[[int], float]:
     if callable(weight):
-        return lambda i: float(weight(i))
-    if not (isinstance(weight, int | float | np.number) and 0 <= weight < np.inf):
+        changing: Any = weight
+        return lambda i: float(changing(i))
+    if not isinstance(weight, int | float | np.number) or not 0 <= float(weight) < np.inf:
         raise ValueError(f"{name} must be a number >= 0 or a schedule, but is {weight!r}.")
-    number = float(weight)  # type: ignore[arg-type]
-    return lambda i: number
+    constant = float(weight)
+    return lambda i: constant
 
 
 def _name(x: Any) -> Any:

@@ -19,8 +19,7 @@ import numpy as np
 
 from jaxvr._core.checks import (
     as_floats,
-    default_float,
-    float_dtype,
+    common_float,
     is_concrete,
     require_finite,
     require_shape,
@@ -50,7 +49,7 @@ class TransferFunction:
     extinctions: Array
 
     def __init__(self, positions: Any, colors: Any, extinctions: Any, *, dtype: Any = None):
-        dtype = _dtype(dtype, positions, colors, extinctions)
+        dtype = common_float(dtype, positions, colors, extinctions)
         positions = as_floats("positions", positions, ndim=1, dtype=dtype)
         colors = as_floats("colors", colors, ndim=2, dtype=dtype)
         extinctions = as_floats("extinctions", extinctions, ndim=1, dtype=dtype)
@@ -105,7 +104,7 @@ class TransferFunction:
         """
         if not is_concrete(positions):
             raise ValueError("from_colormap needs known positions; call it outside jit and grad.")
-        dtype = _dtype(dtype, positions, extinctions)
+        dtype = common_float(dtype, positions, extinctions)
         positions = np.asarray(as_floats("positions", positions, ndim=1, dtype=np.float64))
         require_finite("positions", positions)
         _require_sorted(positions)
@@ -145,7 +144,7 @@ class TransferFunction:
         larger opacities are then lowered.
         """
         _require_convention(convention)
-        dtype = _dtype(dtype, positions, colors, opacities)
+        dtype = common_float(dtype, positions, colors, opacities)
         opacities = as_floats("opacities", opacities, ndim=1, dtype=dtype)
         unit = as_floats("unit_distance", unit_distance, ndim=0, dtype=dtype)
         require_finite("opacities", opacities)
@@ -308,16 +307,6 @@ def _set(tf: TransferFunction, positions: Any, colors: Any, extinctions: Any) ->
     object.__setattr__(tf, "positions", positions)
     object.__setattr__(tf, "colors", colors)
     object.__setattr__(tf, "extinctions", extinctions)
-
-
-def _dtype(dtype: Any, *arrays: Any) -> np.dtype:
-    """The dtype asked for, else the widest float among the arrays, else JAX's default."""
-    if dtype is not None:
-        return float_dtype(dtype)
-    floats = [
-        a.dtype for a in arrays if hasattr(a, "dtype") and jnp.issubdtype(a.dtype, jnp.floating)
-    ]
-    return float_dtype(jnp.result_type(*floats)) if floats else default_float()
 
 
 def _span(positions: np.ndarray) -> np.ndarray:

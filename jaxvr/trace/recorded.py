@@ -29,7 +29,7 @@ class Segments:
 
     scalar (N,), length (N,): nodes, ray after ray. start (R + 1,) int32: each ray's run.
     status (R,) int32. order (R,) int32: place of each ray in the image, row by row.
-    shape: shape of the image, (height, width), or that of the rays. count: number of segments.
+    shape: shape of the image, (height, width), or that of the rays.
     """
 
     scalar: Array
@@ -38,7 +38,11 @@ class Segments:
     status: Array
     order: Array
     shape: tuple[int, ...] = static(default=())
-    count: int = static(default=0)
+
+    @property
+    def count(self) -> int:
+        """Number of nodes in use: segments, and one more for each entry or jump."""
+        return int(self.start[-1])
 
     @property
     def nbytes(self) -> int:

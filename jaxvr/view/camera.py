@@ -23,7 +23,7 @@ import numpy as np
 
 from jaxvr._core.checks import (
     as_floats,
-    default_float,
+    common_float,
     float_dtype,
     is_concrete,
     require_finite,
@@ -124,7 +124,9 @@ class Camera:
         """
         lo, hi = volume.bounds()
         given = getattr(lo, "dtype", None)
-        dtype = _dtype(dtype, lo) if given is None or dtype is not None else float_dtype(given)
+        dtype = (
+            common_float(dtype, lo) if given is None or dtype is not None else float_dtype(given)
+        )
         named = {"azimuth": azimuth, "elevation": elevation, "fov": fov, "zoom": zoom}
         az, el, angle, magnification = (_scalar(name, x, dtype) for name, x in named.items())
         _require_between("fov", angle, 0.0, 180.0, "degrees")
@@ -231,7 +233,7 @@ def _normalize(v: Array) -> Array:
 def _make(
     eye: Any, target: Any, up: Any, fov: Any, extent: Any, width: Any, height: Any, dtype: Any
 ) -> Camera:
-    dtype = _dtype(dtype, eye, target, up)
+    dtype = common_float(dtype, eye, target, up)
     eye, target, up = (_vector(*v, dtype) for v in (("eye", eye), ("target", target), ("up", up)))
     if fov is not None and extent is not None:
         raise ValueError("A camera has a fov (pinhole) or an extent (orthographic), not both.")
@@ -248,16 +250,6 @@ def _make(
     return Camera(
         jnp.asarray(eye), jnp.asarray(target), jnp.asarray(up), fov, extent, width, height
     )
-
-
-def _dtype(dtype: Any, *arrays: Any) -> np.dtype:
-    """The dtype asked for, else the widest float among the arrays, else JAX's default."""
-    if dtype is not None:
-        return float_dtype(dtype)
-    floats = [
-        a.dtype for a in arrays if hasattr(a, "dtype") and jnp.issubdtype(a.dtype, jnp.floating)
-    ]
-    return float_dtype(jnp.result_type(*floats)) if floats else default_float()
 
 
 def _vector(name: str, x: Any, dtype: Any) -> Any:

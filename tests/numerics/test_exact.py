@@ -46,7 +46,8 @@ def edges(dtype):
 
 
 def side(points, first):
-    return edge_side(*(halves(x) for x in points), first)
+    xi, yi, xj, yj = (halves(x) for x in points)
+    return edge_side(xi, yi, xj, yj, first)
 
 
 def test_side_of_an_edge_is_always_right(dtype):

@@ -1,0 +1,65 @@
+"""What the adjoints promise about modes and memory. That they agree is in test_registry."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import registry
+
+import jaxvr
+from experiments.memory import reserved
+from jaxvr.volume import datasets
+
+
+def test_memory_of_replay_does_not_grow_with_cells_per_ray():
+    short, long = (datasets.box((1, 1, n), dtype="float32") for n in (4, 40))
+    replay = [reserved(mesh, 32, jaxvr.Replay()) for mesh in (short, long)]
+    # Ten times the cells on a ray; what grows is one hierarchy over the boundary.
+    mesh_bytes = 40 * long.n_tets
+    assert replay[1] - replay[0] < 2 * mesh_bytes + 0.1 * replay[0]
+
+
+def test_memory_of_direct_does():
+    mesh = datasets.box((1, 1, 4), dtype="float32")
+    few, many = (reserved(mesh, 32, jaxvr.Direct(max_steps=n)) for n in (16, 64))
+    assert many > 2.5 * few
+
+
+@pytest.fixture(scope="module")
+def image():
+    mesh, camera = registry.mesh_of("point", "float64"), registry.camera_of("float64")
+
+    def of(transfer, adjoint):
+        return jaxvr.render(mesh, camera, transfer, adjoint=adjoint)
+
+    return of
+
+
+def test_modes_that_an_adjoint_does_not_have_are_errors(image):
+    transfer = registry.transfer_of("float64")
+    with pytest.raises(TypeError, match="custom_vjp"):
+        jax.jvp(lambda t: image(t, jaxvr.Replay()), (transfer,), (transfer,))
+    with pytest.raises(ValueError, match="[Rr]everse-mode differentiation"):
+        jax.grad(lambda t: image(t, jaxvr.Forward()).sum())(transfer)
+
+
+def test_jacobian_and_gradient_under_vmap(image):
+    """grad of a vmap is the sum of a vmap of grads."""
+    transfer = registry.transfer_of("float64")
+    scales = jnp.array([0.5, 1.0, 2.0])
+
+    def loss(scale):
+        return jnp.sum(image(transfer.scaled(scale), jaxvr.Replay()) ** 2)
+
+    each = jax.vmap(jax.grad(loss))(scales)
+    at_once = jax.grad(lambda s: jax.vmap(loss)(s).sum())(scales)
+    assert np.allclose(each, at_once, rtol=1e-12)
+    assert float(each[1]) == pytest.approx(float(jax.grad(loss)(scales[1])), rel=1e-12)
+
+
+def test_nothing_to_differentiate_is_no_error(image):
+    transfer = registry.transfer_of("float64")
+    zero = jax.grad(lambda x: image(transfer, jaxvr.Replay()).sum() + x)(1.0)
+    assert float(zero) == 1.0
