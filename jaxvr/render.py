@@ -36,6 +36,8 @@ Array = jax.Array
 # starting a kernel, few enough that they take about as many steps and their state stays in cache.
 TILE = (16, 32)
 BATCH = TILE[0] * TILE[1]
+# Accelerators want many more at once; not measured yet.
+ACCELERATOR_BATCH = 1 << 18
 
 
 def render(
@@ -257,9 +259,10 @@ def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):
 
 
 def _batches(arrays: Any) -> tuple[Any, int]:
-    """Arrays (R, ...) as batches (n, BATCH, ...), the last filled up with copies; and R."""
+    """Arrays (R, ...) as batches (n, size, ...), the last filled up with copies; and R."""
     count = arrays[0].shape[0]
-    size = min(BATCH, max(count, 1))
+    most = BATCH if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
+    size = min(most, max(count, 1))
     number = -(-count // size)
 
     def split(x):
