@@ -163,7 +163,7 @@ def trace(
     # Buffers are rounded up to three leading bits, so that similar views share compiled functions.
     unit = 1 << max(int(start[-1]).bit_length() - 3, 10)
     total = -(-max(int(start[-1]), 1) // unit) * unit
-    nodes, segments = _fill(tracer, volume, origins, directions, start[:-1].astype(np.int32), total)
+    nodes = _fill(tracer, volume, origins, directions, start[:-1].astype(np.int32), total)
     return Segments(
         nodes.scalar,
         nodes.length,
@@ -241,7 +241,7 @@ def _fill(tracer, volume, origins, directions, start, total):
     scene = tracer.prepare(volume)
     (origins, directions, start), _ = _batches((origins, directions, start))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
-    return fill(tracer, scene, rays, start, total), None
+    return fill(tracer, scene, rays, start, total)
 
 
 def _run(pipeline, adjoint, volume, origins, directions, transfer):

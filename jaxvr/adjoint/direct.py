@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -31,10 +30,10 @@ class Direct(AbstractAdjoint):
     def run(self, pipeline, operands):
         def one(batch):
             def body(march, _):
-                done = jax.tree.map(lax.stop_gradient, busy(march))
-                return lax.cond(
-                    done, lambda m: iterate(pipeline, batch, m), lambda m: m, march
-                ), None
+                march = lax.cond(
+                    busy(march), lambda m: iterate(pipeline, batch, m), lambda m: m, march
+                )
+                return march, None
 
             march, _ = lax.scan(body, begin(pipeline, batch), length=self.max_steps)
             rgba, bits = finish(pipeline, march)

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core.stage import stage
-from jaxvr.trace.face import crossing, is_positive, opposite_edges
+from jaxvr.trace.face import crossing, is_positive, opposite_edges, sizes_of
 from jaxvr.trace.scene import Scene, entry_corners, fetch, local_ids
 from jaxvr.trace.shear import ShearedRays
 from jaxvr.volume import packing
@@ -148,7 +148,7 @@ def _test(scene: Scene, rays: ShearedRays, word: Array, valid: Array):
     edges = stage(wanted, opposite_edges, a, b, c)
     inwards = packing.flag_of(word) == 1
     contained = jnp.all(is_positive(edges) == inwards[None], 0)
-    crossed = stage(wanted, lambda *x: crossing(x[:3], jnp.abs(x[3])), a, b, c, edges)
+    crossed = stage(wanted, lambda *x: crossing(x[:3], sizes_of(x[3])), a, b, c, edges)
     return contained, crossed.z
 
 

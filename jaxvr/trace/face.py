@@ -69,6 +69,11 @@ def is_positive(area: Array) -> Array:
     return ~jnp.signbit(area)
 
 
+def sizes_of(area: Array) -> Array:
+    """|area| of `edges`, with a derivative at zero too: that of the side that its sign names."""
+    return jnp.where(is_positive(area), area, -area)
+
+
 def opposite_edges(a: Array, b: Array, c: Array) -> Array:
     """The edges (b, c), (c, a), (a, b) of a face (3, R), vertices in the mesh's order.
 

@@ -39,6 +39,7 @@ from jaxvr.trace.face import (
     crossing_at,
     edges,
     is_positive,
+    sizes_of,
 )
 from jaxvr.trace.scene import Scene, entry_corners, local_ids, value_slots
 from jaxvr.trace.shear import VALUE, Z_LOW, ShearedRays, X, Y, Z
@@ -60,9 +61,8 @@ def leave_by(positive: Array, weights: Array, to_apex: Array) -> Exit:
     side = is_positive(to_apex) == positive[None]
     to_a, to_b, to_c = side
     drop = jnp.where(to_c & ~to_b, 0, jnp.where(to_a & ~to_c, 1, 2)).astype(jnp.int32)
-    sizes = jnp.where(is_positive(to_apex), to_apex, -to_apex)
     lost = (to_a == to_b) & (to_b == to_c)
-    return Exit(drop, exit_sizes(weights, sizes, drop), lost)
+    return Exit(drop, exit_sizes(weights, sizes_of(to_apex), drop), lost)
 
 
 def exit_sizes(weights: Array, to_apex: Array, drop: Array) -> Array:

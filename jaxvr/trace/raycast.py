@@ -39,7 +39,7 @@ from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment
 from jaxvr.trace.base import AbstractTracer
 from jaxvr.trace.entry import Boxes, Entries, build_boxes, no_entries, search
-from jaxvr.trace.face import Face, choose, crossing, is_positive, opposite_edges
+from jaxvr.trace.face import Face, choose, crossing, is_positive, opposite_edges, sizes_of
 from jaxvr.trace.local import edges_to_apex, exit_face, leave_by, make_segment, pull_back_cell
 from jaxvr.trace.scene import (
     Scene,
@@ -256,7 +256,7 @@ def _enter(scene: CastScene, rays: ShearedRays, state: CastState, arrival: _Arri
     a, b, c = fetch(mesh, rays, cell, entry_corners(corner), wanted)
     face = (a, b, c)
     edges = stage(wanted, opposite_edges, *face)
-    sizes = jnp.where(is_positive(edges), edges, -edges)
+    sizes = sizes_of(edges)
     at = stage(wanted, crossing, face, sizes)
     word = packing.pack(cell, corner, packing.turned_of(word))
     new = _Arrival(word, is_positive(edges[2]), face, sizes, jnp.stack(at[:2]), at.value)
