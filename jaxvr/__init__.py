@@ -19,7 +19,15 @@ from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay
 from jaxvr.composite import Over
 from jaxvr.fit import FitError, FitResult, fit, fit_parameters
-from jaxvr.optics import Analytic, Quadrature, TransferFunction
+from jaxvr.optics import (
+    Analytic,
+    AverageColor,
+    ConstantExtinction,
+    PartialPreIntegration,
+    PreIntegration,
+    Quadrature,
+    TransferFunction,
+)
 from jaxvr.render import render, render_rays, shade, trace
 from jaxvr.trace import RayCast, Segments
 from jaxvr.view import Camera, psnr, ssim
@@ -35,12 +43,16 @@ from jaxvr.volume import (
 # `jaxvr.plot` is not imported here: it needs matplotlib, which takes a while to load.
 __all__ = [
     "Analytic",
+    "AverageColor",
     "Camera",
+    "ConstantExtinction",
     "Direct",
     "FitError",
     "FitResult",
     "Forward",
     "Over",
+    "PartialPreIntegration",
+    "PreIntegration",
     "Quadrature",
     "RayCast",
     "RenderError",

@@ -253,7 +253,8 @@ def _run(pipeline, adjoint, volume, origins, directions, transfer):
 
 
 def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):
-    table = pipeline.integrator.prepare(transfer, dtype)
+    longest = lax.stop_gradient(pipeline.tracer.longest(scene))
+    table = pipeline.integrator.prepare(transfer, dtype, longest)
     rgba, status = adjoint.run(pipeline, Operands(scene, rays, table))
     return jnp.moveaxis(rgba, 1, 2).reshape(-1, 4)[:count], status.reshape(-1)[:count]
 

@@ -31,7 +31,7 @@ TRACERS = [Entry("RayCast", jaxvr.RayCast)]
 
 INTEGRATORS = [
     Entry("Analytic", jaxvr.Analytic),
-    Entry("Quadrature", lambda: jaxvr.Quadrature(16)),
+    Entry("Quadrature", lambda: jaxvr.Quadrature(samples=16)),
 ]
 
 ADJOINTS = [

@@ -107,7 +107,7 @@ def test_quadrature_is_an_independent_witness(data_path):
     mesh = exactness.read_mesh(data_path("football_zoo.vtu"), None, np.float64)
     reference = Reference(mesh)
     rays = exactness.make_rays(mesh, reference, "random", 100, np.random.default_rng(0))
-    found = exactness.compare(mesh, {"random": rays}, integrator=jaxvr.Quadrature(order=12))
+    found = exactness.compare(mesh, {"random": rays}, integrator=jaxvr.Quadrature(samples=12))
     assert found["worst"] <= 1e-10, found
 
 

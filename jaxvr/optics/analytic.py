@@ -10,7 +10,10 @@ from __future__ import annotations
 import dataclasses
 
 from jaxvr.numerics.moments import emission_weights
+from jaxvr.numerics.rules import DRAFT, FAST
 from jaxvr.optics.integrator import AbstractSlabIntegrator
+
+RULES = {"full": None, "fast": FAST, "draft": DRAFT}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,13 +21,22 @@ class Analytic(AbstractSlabIntegrator):
     """Exact to rounding: rgb and alpha within 1e-15 (float64) or 5e-7 (float32) of the largest
     colour, and their Jacobian within 5e-15 or 7e-7 of its natural scale.
 
+    accuracy: "full" sums 13 nodes in float32 and 23 in float64, to rounding. "fast" sums 7 and
+    errs by up to 9e-6 of a slab's colour, "draft" sums 5 and errs by up to 5e-4, in both dtypes;
+    alpha stays exact, and so does the colour of thin slabs and of those of one colour.
+
     `slab` is differentiable twice and more, in forward and reverse mode. Of whole segments the
     first derivatives are exact and the second are not (see `jaxvr.optics.partition`).
+
+    Raises:
+      ValueError: for another accuracy.
     """
 
-    def slab_integral(self, piece):
-        # rgb = C_front alpha + (C_back - C_front) w_back stays exact for a constant colour.
-        a, b = piece.front[0] * piece.length, piece.back[0] * piece.length
-        alpha, w_back = emission_weights(a, b)
-        color, change = piece.front[1:], piece.back[1:] - piece.front[1:]
-        return color * alpha[None] + change * w_back[None], 0.5 * (a + b)
+    accuracy: str = "full"
+
+    def __post_init__(self):
+        if self.accuracy not in RULES:
+            raise ValueError(f"accuracy must be one of {list(RULES)}, but is {self.accuracy!r}.")
+
+    def weights(self, a, b):
+        return emission_weights(a, b, RULES[self.accuracy])

@@ -2,13 +2,14 @@
 
 An integrator is a frozen dataclass without arrays, so that it can be a static argument of jit.
 Tables that depend on the transfer function are made by `prepare` and travel as a pytree. To add an
-integrator of slabs, derive from `AbstractSlabIntegrator` and write `slab_integral`; one that
+integrator of slabs, derive from `AbstractSlabIntegrator` and write `weights`; one that
 treats whole segments at once (a pre-integrated table) derives from `AbstractIntegrator`.
 """
 
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -25,11 +26,13 @@ from jaxvr.optics.partition import (
     ends,
     gather,
     locate,
+    look_up,
     nodes_of,
 )
 from jaxvr.optics.transfer import TransferFunction
 
 Array = jax.Array
+Weights = Callable[[Array, Array], tuple[Array, Array]]
 
 
 class AbstractIntegrator(abc.ABC):
@@ -52,8 +55,11 @@ class AbstractIntegrator(abc.ABC):
         """
 
     @abc.abstractmethod
-    def prepare(self, transfer: TransferFunction, dtype: Any) -> Any:
-        """The table that `step` looks up, differentiable with respect to `transfer`."""
+    def prepare(self, transfer: TransferFunction, dtype: Any, longest: Array) -> Any:
+        """The table that `step` looks up, differentiable with respect to `transfer`.
+
+        longest (): a bound on the length of a segment, a constant to derivatives.
+        """
 
     @abc.abstractmethod
     def start(self, table: Any, scalar: Array) -> Cursor:
@@ -93,40 +99,39 @@ class AbstractIntegrator(abc.ABC):
 
 
 class AbstractSlabIntegrator(AbstractIntegrator):
-    """Cuts segments at control points, so that only the integral of one slab is left to write."""
+    """Cuts segments at control points, so that only the integral of one slab is left to write.
+
+    In a slab extinction and colour are linear, and light is linear in colour: the colour is
+    C_front w_front + C_back w_back, with weights that depend on a and b only, the extinctions at
+    the two ends times the length. The optical depth is (a + b) / 2.
+    """
 
     @abc.abstractmethod
-    def slab_integral(self, piece: Ends) -> tuple[Array, Array]:
-        """rgb (3, R), premultiplied, and optical depth (R,) of slabs; differentiable."""
+    def weights(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """(w, w_back) of slabs, differentiable; w = w_front + w_back is what a constant colour
+        gets, which is 1 - exp(-(a + b) / 2) for the exact integral.
+
+        Args:
+          a, b (R,): extinction at the front and the back times length, >= 0.
+        """
 
     def slab(self, extinction_front, extinction_back, color_front, color_back, length):
-        tau_f, tau_b = jnp.asarray(extinction_front), jnp.asarray(extinction_back)
-        c_f, c_b, size = jnp.asarray(color_front), jnp.asarray(color_back), jnp.asarray(length)
-        shape = jnp.broadcast_shapes(
-            tau_f.shape, tau_b.shape, c_f.shape[:-1], c_b.shape[:-1], size.shape
-        )
-        dtype = jnp.result_type(tau_f, tau_b, c_f, c_b, size, jnp.float32)
+        operands = (extinction_front, extinction_back, color_front, color_back, length)
+        return slab_of(self.weights, *operands)
 
-        def column(tau, color):
-            tau = jnp.broadcast_to(tau, shape).reshape(1, -1)
-            color = jnp.broadcast_to(color, (*shape, 3)).reshape(-1, 3).T
-            return jnp.concatenate([tau, color]).astype(dtype)
-
-        size = jnp.broadcast_to(size, shape).reshape(-1).astype(dtype)
-        rgb, depth = self.slab_integral(Ends(column(tau_f, c_f), column(tau_b, c_b), size))
-        return rgb.T.reshape(*shape, 3), opacity(depth).reshape(shape)
-
-    def prepare(self, transfer, dtype):
+    def prepare(self, transfer, dtype, longest):
         return nodes_of(transfer, dtype)
 
     def start(self, table, scalar):
-        return Cursor(jax.lax.stop_gradient(scalar), locate(table, scalar))
+        return Cursor(jax.lax.stop_gradient(scalar), locate(table.position, scalar))
 
     def step(self, table, segment, cursor):
         wanted = jnp.any(segment.length > 0)
+        if table.texture is not None:
+            cursor = stage(wanted, look_up, table, segment, cursor)
         piece, cursor, finished = stage(jnp.any(segment.length >= 0), cut, table, segment, cursor)
         slabs = stage(wanted, gather, table, piece)
-        rgb, depth = stage(wanted, lambda *x: self.slab_integral(ends(*x)), piece, segment, slabs)
+        rgb, depth = stage(wanted, lambda *x: shade_slab(self.weights, ends(*x)), piece, segment, slabs)
         return rgb, depth, cursor, finished, (piece, slabs)
 
     def gradient_start(self, table):
@@ -136,7 +141,7 @@ class AbstractSlabIntegrator(AbstractIntegrator):
 
     def pull_back(self, table, segment, piece, cotangent, gradient):
         def pull(segment, piece, slabs, cotangent):
-            _, back = jax.vjp(lambda s, t: self.slab_integral(ends(piece, s, t)), segment, slabs)
+            _, back = jax.vjp(lambda s, t: shade_slab(self.weights, ends(piece, s, t)), segment, slabs)
             return back(cotangent)
 
         piece, slabs = piece
@@ -155,3 +160,39 @@ class AbstractSlabIntegrator(AbstractIntegrator):
         nodes = jnp.zeros((count, 5), gradient.dtype)
         nodes = nodes.at[left].add(gradient[:, :5]).at[right].add(gradient[:, 5:])
         return Nodes(nodes[:, 0], nodes[:, 1:].T)
+
+
+def shade_slab(weights: Weights, piece: Ends) -> tuple[Array, Array]:
+    """rgb (3, R), premultiplied, and optical depth (R,) of slabs; `weights` as in
+    `AbstractSlabIntegrator`."""
+    a, b = piece.front[0] * piece.length, piece.back[0] * piece.length
+    # In kernels of their own, or they are computed again for each channel.
+    w, w_back = stage(jnp.any(piece.length > 0), weights, a, b)
+    color, change = piece.front[1:], piece.back[1:] - piece.front[1:]
+    return color * w[None] + change * w_back[None], 0.5 * (a + b)
+
+
+def slab_of(
+    weights: Weights,
+    extinction_front: Any,
+    extinction_back: Any,
+    color_front: Any,
+    color_back: Any,
+    length: Any,
+) -> tuple[Array, Array]:
+    """`AbstractIntegrator.slab` from weights."""
+    tau_f, tau_b = jnp.asarray(extinction_front), jnp.asarray(extinction_back)
+    c_f, c_b, size = jnp.asarray(color_front), jnp.asarray(color_back), jnp.asarray(length)
+    shape = jnp.broadcast_shapes(
+        tau_f.shape, tau_b.shape, c_f.shape[:-1], c_b.shape[:-1], size.shape
+    )
+    dtype = jnp.result_type(tau_f, tau_b, c_f, c_b, size, jnp.float32)
+
+    def column(tau, color):
+        tau = jnp.broadcast_to(tau, shape).reshape(1, -1)
+        color = jnp.broadcast_to(color, (*shape, 3)).reshape(-1, 3).T
+        return jnp.concatenate([tau, color]).astype(dtype)
+
+    size = jnp.broadcast_to(size, shape).reshape(-1).astype(dtype)
+    rgb, depth = shade_slab(weights, Ends(column(tau_f, c_f), column(tau_b, c_b), size))
+    return rgb.T.reshape(*shape, 3), opacity(depth).reshape(shape)

@@ -59,11 +59,13 @@ class Cursor(NamedTuple):
 class Nodes:
     """A transfer function with channels first: position (K,), optical (4, K).
 
-    Rows of `optical` are extinction, red, green, blue.
+    Rows of `optical` are extinction, red, green, blue. texture (N,) int32, optional: the slab at
+    the middle of each of N equal parts of the line from the first position to the last.
     """
 
     position: Array
     optical: Array
+    texture: Array | None = None
 
 
 class Piece(NamedTuple):
@@ -88,11 +90,49 @@ def nodes_of(transfer: TransferFunction, dtype: Any) -> Nodes:
     return Nodes(transfer.positions.astype(dtype), rows.astype(dtype))
 
 
-def locate(nodes: Nodes, scalar: Array) -> Array:
+def locate(positions: Array, scalar: Array) -> Array:
     """Number of control points at or below each scalar: its slab (the upper one at a border)."""
-    method = "compare_all" if nodes.position.shape[0] <= 32 else "scan_unrolled"
-    found = jnp.searchsorted(_hold(nodes.position), _hold(scalar), side="right", method=method)
+    method = "compare_all" if positions.shape[0] <= 32 else "scan_unrolled"
+    found = jnp.searchsorted(_hold(positions), _hold(scalar), side="right", method=method)
     return found.astype(jnp.int32)
+
+
+def with_texture(nodes: Nodes, size: int) -> Nodes:
+    """The same nodes, with a texture of `size` texels."""
+    low, high = _hold(nodes.position[0]), _hold(nodes.position[-1])
+    middles = (jnp.arange(size).astype(low.dtype) + 0.5) / size
+    texture = locate(nodes.position, low + (high - low) * middles)
+    return Nodes(nodes.position, nodes.optical, texture)
+
+
+def look_up(nodes: Nodes, segment: Segment, cursor: Cursor) -> Cursor:
+    """The cursor with its slab found anew in the texture, as in Espinha and Celes 2005, Figure 6.
+
+    Their texture over (s_front, s_back) stores the next control point and the one behind it, for
+    the case that s_front stands at the first already, or the loop would not end. Which control
+    point is next depends on s_back only in so far as it tells the direction, and the one behind it
+    is the next index: so a row of slabs holds the same information. Where several control points
+    share a texel both are wrong. Then the cursor's own slab stays.
+    """
+    assert nodes.texture is not None
+    count, size = nodes.position.shape[0], nodes.texture.shape[0]
+    low, high = _hold(nodes.position[0]), _hold(nodes.position[-1])
+    width = high - low
+    texel = (cursor.scalar - low) * (size / jnp.where(width > 0, width, 1))
+    slab = nodes.texture[jnp.clip(texel.astype(jnp.int32), 0, size - 1)]
+    rising = _hold(segment.back) >= _hold(segment.front)
+    floor, ceiling = _borders(nodes, slab, count)
+    passed = jnp.where(rising, cursor.scalar >= ceiling, cursor.scalar <= floor)
+    slab = slab + jnp.where(passed, jnp.where(rising, 1, -1), 0).astype(jnp.int32)
+    floor, ceiling = _borders(nodes, slab, count)
+    right = (cursor.scalar >= floor) & (cursor.scalar <= ceiling)
+    return Cursor(cursor.scalar, jnp.where(right, slab, cursor.slab))
+
+
+def _borders(nodes: Nodes, slab: Array, count: int) -> tuple[Array, Array]:
+    positions = _hold(nodes.position)
+    floor = jnp.where(slab == 0, -jnp.inf, positions[jnp.maximum(slab - 1, 0)])
+    return floor, jnp.where(slab == count, jnp.inf, positions[jnp.minimum(slab, count - 1)])
 
 
 def cut(nodes: Nodes, segment: Segment, cursor: Cursor) -> tuple[Piece, Cursor, Array]:

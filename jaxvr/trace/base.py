@@ -50,6 +50,10 @@ class AbstractTracer(abc.ABC):
         those of the volume."""
 
     @abc.abstractmethod
+    def longest(self, scene: Any) -> Array:
+        """A bound () on the length of a segment, for integrators whose tables end somewhere."""
+
+    @abc.abstractmethod
     def prepare_rays(self, scene: Any, origins: Array, directions: Array) -> Any:
         """Arrays (R,) of what steps need of the rays (R, 3), differentiable."""
 

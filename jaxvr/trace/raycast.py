@@ -46,6 +46,7 @@ from jaxvr.trace.scene import (
     entry_corners,
     fetch,
     local_ids,
+    longest_edge,
     make_scene,
     value_slots,
 )
@@ -120,6 +121,9 @@ class RayCast(AbstractTracer):
     def prepare(self, volume: TetMesh) -> CastScene:
         scene = make_scene(volume)
         return CastScene(scene, build_boxes(scene))
+
+    def longest(self, scene: CastScene) -> Array:
+        return longest_edge(scene.mesh)
 
     def prepare_rays(self, scene: CastScene, origins: Array, directions: Array) -> ShearedRays:
         return shear_rays(origins, directions, scene.mesh.scale)

@@ -81,6 +81,9 @@ class Recorded(AbstractTracer):
     def prepare(self, volume: Segments) -> Nodes:
         return Nodes(volume.scalar, volume.length)
 
+    def longest(self, scene: Nodes) -> Array:
+        return jnp.max(scene.length)
+
     def prepare_rays(self, scene: Nodes, origins: Array, directions: Array) -> Runs:
         """Here rays are runs of nodes: `origins` their first and `directions` their end nodes."""
         return Runs(origins, directions)

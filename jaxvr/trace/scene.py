@@ -10,6 +10,8 @@ products of projected coordinates clear of underflow whatever the user's unit of
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -78,6 +80,20 @@ def merged_points(mesh: TetMesh) -> Array:
     group = jnp.ones(mesh.points.shape[0], away.dtype).at[first].add(1.0)
     mean = mesh.points.at[first].add(away / group[first][:, None])
     return mean.at[copy].set(mean[first])
+
+
+def longest_edge(scene: Scene) -> Array:
+    """Length () of the longest edge, in world units: no chord of a cell is longer."""
+    count = scene.coordinates.shape[0] // 3
+    corners = [scene.cells[k::4] for k in range(4)]
+    squares = []
+    for first, second in itertools.combinations(corners, 2):
+        change = [
+            scene.coordinates[axis * count + first] - scene.coordinates[axis * count + second]
+            for axis in range(3)
+        ]
+        squares.append(jnp.max(sum(x * x for x in change)))
+    return jnp.sqrt(jnp.max(jnp.stack(squares))) / scene.scale
 
 
 def local_ids(scene: Scene, cell: Array, corner: Array) -> Array:
