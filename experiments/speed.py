@@ -183,7 +183,9 @@ def run(path: Path, size: int, repeat: int, peers: bool, threads: int = 2) -> di
         "value_and_grad, shade": lambda: by_shade(transfer, segments),
     }
     image = np.asarray(render(mesh, transfer))
-    truth = np.asarray(jaxvr.render(mesh, camera, transfer, integrator=jaxvr.Quadrature(samples=12)))
+    truth = np.asarray(
+        jaxvr.render(mesh, camera, transfer, integrator=jaxvr.Quadrature(samples=12))
+    )
     result: dict[str, Any] = {
         "mesh": path.stem,
         "size": size,

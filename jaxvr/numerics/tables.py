@@ -55,7 +55,7 @@ def psi_table(size: int) -> np.ndarray:
     """psi (size, size) at gamma = 0, 1 / (size - 1), ..., 1, float64; rows are gamma_a."""
     gamma = np.arange(size) / (size - 1)
     depth = np.where(gamma < 1, gamma / np.maximum(1 - gamma, 1e-300), 1e90)
-    return sum(_moments(*np.meshgrid(depth, depth, indexing="ij")))
+    return np.sum(_moments(*np.meshgrid(depth, depth, indexing="ij")), axis=0)
 
 
 @functools.lru_cache

@@ -131,7 +131,9 @@ class AbstractSlabIntegrator(AbstractIntegrator):
             cursor = stage(wanted, look_up, table, segment, cursor)
         piece, cursor, finished = stage(jnp.any(segment.length >= 0), cut, table, segment, cursor)
         slabs = stage(wanted, gather, table, piece)
-        rgb, depth = stage(wanted, lambda *x: shade_slab(self.weights, ends(*x)), piece, segment, slabs)
+        rgb, depth = stage(
+            wanted, lambda *x: shade_slab(self.weights, ends(*x)), piece, segment, slabs
+        )
         return rgb, depth, cursor, finished, (piece, slabs)
 
     def gradient_start(self, table):
@@ -141,7 +143,9 @@ class AbstractSlabIntegrator(AbstractIntegrator):
 
     def pull_back(self, table, segment, piece, cotangent, gradient):
         def pull(segment, piece, slabs, cotangent):
-            _, back = jax.vjp(lambda s, t: shade_slab(self.weights, ends(piece, s, t)), segment, slabs)
+            _, back = jax.vjp(
+                lambda s, t: shade_slab(self.weights, ends(piece, s, t)), segment, slabs
+            )
             return back(cotangent)
 
         piece, slabs = piece

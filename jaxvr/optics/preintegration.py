@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core.pytree import pytree
+from jaxvr._core.stage import stage
 from jaxvr.numerics.moments import emission_weights, opacity
 from jaxvr.optics.integrator import slab_of
 from jaxvr.optics.partition import Nodes, Segment, nodes_of
@@ -80,7 +81,9 @@ class PreIntegration(AbstractWholeIntegrator):
         if self.scale not in ("linear", "log"):
             raise ValueError(f"scale must be 'linear' or 'log', but is {self.scale!r}.")
         if self.schedule not in SCHEDULES:
-            raise ValueError(f"schedule must be one of {list(SCHEDULES)}, but is {self.schedule!r}.")
+            raise ValueError(
+                f"schedule must be one of {list(SCHEDULES)}, but is {self.schedule!r}."
+            )
         if self.bits not in (None, 8, 16):
             raise ValueError(f"bits must be None, 8 or 16, but is {self.bits!r}.")
 
@@ -109,17 +112,17 @@ class PreIntegration(AbstractWholeIntegrator):
             slices = _rounded(slices, self.bits)
         # Length varies fastest: the two entries that a lookup blends first are neighbours.
         rows = slices.transpose(2, 3, 0, 1).reshape(-1, 4)
-        return Table(
-            rows, Frame(low, high, nodes.optical[:, 0], nodes.optical[:, -1], longest)
-        )
+        return Table(rows, Frame(low, high, nodes.optical[:, 0], nodes.optical[:, -1], longest))
 
     def _build(self, nodes: Nodes, longest: Array) -> Array:
         """Slices (n_l, 4, n_f, n_b)."""
         n_f, n_b, n_l = self.size
         low, high = nodes.position[0], nodes.position[-1]
-        scalars = tuple(
-            low + (high - low) * jnp.arange(n).astype(longest.dtype) / (n - 1) for n in (n_f, n_b)
-        )
+
+        def over(n):
+            return low + (high - low) * jnp.arange(n).astype(longest.dtype) / (n - 1)
+
+        scalars = over(n_f), over(n_b)
         lengths = self._length(jnp.arange(1, n_l), longest)
         if not self.incremental:
             slices = direct(nodes, scalars, lengths)
@@ -169,19 +172,29 @@ class PreIntegration(AbstractWholeIntegrator):
         return jnp.stack([first + s for s in steps])
 
     def blend(self, frame, rows, segment):
-        n_f, n_b, _ = self.size
-        before, (front, back, length), after = _parts(frame, segment)
-        (_, u), (_, v) = _node(front, frame, n_f), _node(back, frame, n_b)
-        _, w = self._slice(length, frame.longest)
-        rows = rows[:, 0::2] + w[None, None] * (rows[:, 1::2] - rows[:, 0::2])
-        rows = rows[:, 0::2] + v[None, None] * (rows[:, 1::2] - rows[:, 0::2])
-        inside = rows[:, 0] + u[None] * (rows[:, 1] - rows[:, 0])
+        # Stages, or everything up to here is computed again for each of the four channels.
+        wanted = jnp.any(segment.length > 0)
+        way, before, after = stage(wanted, self._ways, frame, segment)
+        inside = stage(wanted, _trilinear, rows, way)
         alpha = jnp.clip(inside[3], 0, 1 - jnp.finfo(inside.dtype).epsneg)
         # In front of the table's part, and behind it.
         (color, depth), (far_color, far_depth) = before, after
         rgb = inside[:3] + ((1 - alpha) * opacity(far_depth))[None] * far_color
         rgb = opacity(depth)[None] * color + jnp.exp(-depth)[None] * rgb
         return rgb, depth - jnp.log1p(-alpha) + far_depth
+
+    def _ways(self, frame, segment):
+        n_f, n_b, _ = self.size
+        before, (front, back, length), after = _parts(frame, segment)
+        (_, u), (_, v) = _node(front, frame, n_f), _node(back, frame, n_b)
+        _, w = self._slice(length, frame.longest)
+        return (u, v, w), before, after
+
+
+def _trilinear(rows: Array, way: tuple[Array, Array, Array]) -> Array:
+    for t in reversed(way):
+        rows = rows[:, 0::2] + t[None, None] * (rows[:, 1::2] - rows[:, 0::2])
+    return rows[:, 0]
 
 
 def _rounded(table: Array, bits: int) -> Array:

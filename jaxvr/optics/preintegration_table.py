@@ -53,7 +53,9 @@ def exact_slice(nodes: Nodes, front: Array, back: Array, length: Array) -> Array
         width = high - low
         per_width = jnp.where(width > 0, 1 / jnp.where(width > 0, width, 1), 0)
         s_0, s_1 = (jnp.clip(s, low, high) for s in (front, back))
-        holds = (front >= low) & ((front < high) | ((front == high) & (high == last) & (low < high)))
+        holds = (front >= low) & (
+            (front < high) | ((front == high) & (high == last) & (low < high))
+        )
         share = jnp.where(flat, holds.astype(front.dtype), (s_1 - s_0) * per_change) * length
         color = [
             start[:, None] + ((s - low) * per_width)[None] * (end - start)[:, None]

@@ -68,7 +68,9 @@ def segment_of(cases, dtype):
     return Segment(*(jnp.asarray(x, dtype) for x in np.array(cases).T))
 
 
-@pytest.mark.parametrize("integrator", [Analytic(), Quadrature(samples=24)], ids=lambda i: type(i).__name__)
+@pytest.mark.parametrize(
+    "integrator", [Analytic(), Quadrature(samples=24)], ids=lambda i: type(i).__name__
+)
 def test_pieces_add_up_to_the_segment(integrator, dtype):
     segment = segment_of(CASES, dtype)
     tf = TF.astype(dtype)
@@ -142,8 +144,3 @@ def test_slab_is_differentiable_twice():
 
     args = (jnp.array(0.7), jnp.array(2.0), jnp.array([0.1, 0.5, 0.9]), jnp.ones(3), jnp.array(1.3))
     check_grads(loss, args, order=2, modes=["fwd", "rev"], rtol=1e-6)
-
-
-def test_quadrature_order_is_checked():
-    with pytest.raises(ValueError, match="order must be a positive integer"):
-        Quadrature(0)
