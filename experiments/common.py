@@ -1,11 +1,14 @@
-"""What experiments share: transfer functions with features, and folders for results."""
+"""What experiments share: transfer functions with features, errors of pictures, tables of numbers
+and folders for results."""
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import jaxvr
@@ -47,6 +50,86 @@ def shells(
     dtype = volume.points.dtype
     extinctions = np.asarray(depth / diagonal(volume) * density, dtype)
     return jaxvr.TransferFunction.from_colormap(colormap, positions, extinctions, dtype=dtype)
+
+
+def spikes(
+    volume: Any,
+    centres: Any,
+    half_width: float,
+    colormap: Any = "turbo",
+    depth: float = 1000.0,
+    floor: float = 1e-4,
+) -> jaxvr.TransferFunction:
+    """A transfer function of sharp peaks, like isosurfaces: four control points at its ends and
+    three a peak.
+
+    centres: of the peaks, as parts of the range, ascending. half_width: from the tip of a peak to
+    its foot, as part of the range. depth, floor: as for `shells`, of tips and between them.
+    """
+    values = np.asarray(volume.values, np.float64)
+    tips = np.asarray(centres, np.float64)
+    t = np.concatenate([[0], (tips[:, None] + half_width * np.array([-1, 0, 1])).ravel(), [1]])
+    density = np.full(len(t), floor)
+    density[2:-1:3] = 1
+    positions = values.min() + (values.max() - values.min()) * t
+    dtype = volume.points.dtype
+    extinctions = np.asarray(depth / diagonal(volume) * density, dtype)
+    return jaxvr.TransferFunction.from_colormap(colormap, positions, extinctions, dtype=dtype)
+
+
+def errors(image: Any, reference: Any) -> dict[str, float]:
+    """How an image (H, W, 4) differs from another one.
+
+    max, mean, rms and psnr (dB) over all pixels and channels. bias: mean of image - reference over
+    r, g and b, as seen over black. brightness: the ratio of their sums, less 1.
+    """
+    a, b = (np.asarray(x, np.float64) for x in (image, reference))
+    gap = a - b
+    light = b[..., :3].sum()
+    return {
+        "max": float(np.abs(gap).max()),
+        "mean": float(np.abs(gap).mean()),
+        "rms": float(np.sqrt((gap**2).mean())),
+        "psnr": float(jaxvr.psnr(a, b)),
+        "bias": float(gap[..., :3].mean()),
+        "brightness": float(gap[..., :3].sum() / light) if light else 0.0,
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Rows with equal keys as aligned text; None is a dash."""
+
+    def text(x):
+        return "-" if x is None else f"{x:.3g}" if isinstance(x, float) else str(x)
+
+    cells = [list(rows[0]), *([text(x) for x in row.values()] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = [[f"{x:>{w}}" for x, w in zip(line, widths, strict=True)] for line in cells]
+    return "\n".join("  ".join(line).rstrip() for line in lines)
+
+
+def in_float64(tree: Any) -> Any:
+    """A mesh, camera or transfer function with its floats widened; needs jax_enable_x64."""
+    return jax.tree.map(
+        lambda x: x.astype(np.float64) if np.issubdtype(x.dtype, np.floating) else x, tree
+    )
+
+
+def picture_options(description: str | None, arguments: Any) -> argparse.Namespace:
+    """Options of an experiment that makes pictures of a mesh; `volume` is the mesh, in float32."""
+    parser = argparse.ArgumentParser(description=(description or "").splitlines()[0])
+    parser.add_argument("mesh", type=Path, nargs="?", help="any mesh file; none: a small box")
+    parser.add_argument("--field")
+    parser.add_argument("--size", type=int, default=512, help="pixels along each side")
+    parser.add_argument("--out", type=Path, help="folder for pictures")
+    parser.add_argument("--json", type=Path, help="write the numbers there")
+    parser.add_argument("--tiny", action="store_true", help="a few pixels and small tables")
+    options = parser.parse_args(arguments)
+    if options.mesh is None:
+        options.volume = jaxvr.datasets.box((4, 4, 4), jitter=0.2, dtype="float32")
+    else:
+        options.volume = jaxvr.read_mesh(options.mesh, field=options.field, dtype="float32")
+    return options
 
 
 def write_json(path: Any, data: Any) -> Path:

@@ -142,13 +142,19 @@ def _positive(mesh: jaxvr.TetMesh) -> np.ndarray:
     return tets
 
 
-def median_of(tasks: dict[str, Callable[[], Any]], repeat: int) -> dict[str, float]:
-    """Median seconds of each task, taking turns, after one call of each that is not counted."""
+def median_of(
+    tasks: dict[str, Callable[[], Any]], repeat: int, *, quiet: bool = False
+) -> dict[str, float]:
+    """Median seconds of each task, taking turns, after one call of each that is not counted.
+
+    quiet: do not print how long those first calls took.
+    """
     seconds: dict[str, list[float]] = {name: [] for name in tasks}
     for name, task in tasks.items():
         start = time.perf_counter()
         jax.block_until_ready(task())
-        print(f"  first {name:28s} {time.perf_counter() - start:8.2f} s", flush=True)
+        if not quiet:
+            print(f"  first {name:28s} {time.perf_counter() - start:8.2f} s", flush=True)
     for _ in range(repeat):
         for name, task in tasks.items():
             start = time.perf_counter()

@@ -114,6 +114,68 @@ def difference(a: Any, b: Any, *, scale: float | None = None, title: str | None 
     return figure
 
 
+def against(
+    images: Sequence[Any],
+    reference: Any,
+    titles: Sequence[str],
+    *,
+    scale: float | None = None,
+    window: tuple[int, int, int] | None = None,
+    background: Any = (0.0, 0.0, 0.0),
+    srgb: bool = False,
+) -> Figure:
+    """A figure with pictures in a row, the reference last, and below each how it differs from it.
+
+    Differences are picture - reference as seen over the background, the mean of r, g and b with
+    its sign, all in one scale: red is brighter, blue darker. By default it reaches to the 99.5 %
+    quantile of all of them, and what lies beyond has the last colour. The numbers above them are
+    over r, g and b of all pixels.
+
+    titles: one each, and one for the reference. window (row, column, size): a square that is framed
+    in each picture and shown again below it, its contrast raised alike in all.
+    """
+    if len(images) == 0 or len(titles) != len(images) + 1:
+        raise ValueError(
+            f"against needs images, and a title for each and for the reference, but there are "
+            f"{len(images)} images and {len(titles)} titles."
+        )
+    shown = [_opaque(x, background) for x in (*images, reference)]
+    gaps = [x - shown[-1] for x in shown[:-1]]
+    signed = [gap.mean(-1) for gap in gaps]
+    if scale is None:
+        scale = float(np.quantile(np.abs(signed), 0.995)) or 1.0
+    rows = 2 if window is None else 3
+    figure = Figure(figsize=(3.2 * len(shown), 3.5 * rows), dpi=100, layout="constrained")
+    axes = figure.subplots(rows, len(shown), squeeze=False)
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for ax, image, title in zip(axes[0], shown, titles, strict=True):
+        show(image, title=title, srgb=srgb, ax=ax)
+    if window is not None:
+        row, column, size = window
+        part = np.s_[row : row + size, column : column + size]
+        low, high = shown[-1][part].min(), shown[-1][part].max()
+        for ax, below, image in zip(axes[0], axes[1], shown, strict=True):
+            corners = (
+                column + size * np.array([0, 1, 1, 0, 0]),
+                row + size * np.array([0, 0, 1, 1, 0]),
+            )
+            ax.plot(*(x - 0.5 for x in corners), color="white", linewidth=1)
+            stretched = np.clip((image[part] - low) / ((high - low) or 1.0), 0, 1)
+            show(stretched, title="the frame, contrast raised", srgb=srgb, ax=below)
+    for ax, gap, part in zip(axes[-1], gaps, signed, strict=False):
+        drawn = ax.imshow(part, cmap="RdBu_r", vmin=-scale, vmax=scale, interpolation="nearest")
+        ax.set_title(
+            f"difference: max {np.abs(gap).max():.1e}, rms {np.sqrt((gap**2).mean()):.1e}",
+            fontsize="small",
+        )
+    bar = axes[-1, -1].inset_axes((0.05, 0.1, 0.07, 0.8))
+    figure.colorbar(drawn, cax=bar, extend="both", format="%.1e")
+    legend = "mean of r, g, b: red is brighter, blue darker"
+    axes[-1, -1].set_title(legend, fontsize="small", loc="left")
+    return figure
+
+
 def plot_transfer(
     tf: TransferFunction,
     ax: Axes | None = None,
@@ -182,6 +244,15 @@ def _bytes(image: Any, background: Any, srgb: bool) -> np.ndarray:
     elif image.shape[-1] == 4:
         image = np.asarray(_images.unpremultiply(image))
     return _images.to_uint8(image, srgb=srgb)
+
+
+def _opaque(image: Any, background: Any) -> np.ndarray:
+    """An image over a background, (H, W, 3) in float64."""
+    image = as_floats("image", image, ndim=3)
+    if image.shape[-1] == 4:
+        image = _images.composite_over(image, background)
+    require_finite("image", image)
+    return np.asarray(image, np.float64)[..., :3]
 
 
 def _figure(rows: int, columns: int, size: float, width: float | None = None) -> list[Axes]:

@@ -18,20 +18,40 @@ from jaxvr.volume import datasets
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """name, what makes it, and flags; `exact` means equal to `Analytic` to rounding."""
+    """name, what makes it, and what it can do.
+
+    error: largest difference of an integrator's image from `Analytic`'s in the setting of
+    test_registry, whose transfer function has a jump. slope: difference of its derivative with
+    respect to colours and extinctions, relative. None for both: equal to rounding. variant: the
+    same code as another entry, but for its weights; crossed with all adjoints in `shade` only.
+    """
 
     name: str
     make: Callable[[], Any]
-    exact: bool = True
+    error: float | None = None
+    slope: float | None = None
+    variant: bool = False
     forward: bool = True
     reverse: bool = True
 
 
 TRACERS = [Entry("RayCast", jaxvr.RayCast)]
 
+_SMALL = (24, 24, 8)
 INTEGRATORS = [
     Entry("Analytic", jaxvr.Analytic),
+    Entry("fast", lambda: jaxvr.Analytic("fast"), 1e-6, 1e-6, variant=True),
+    Entry("draft", lambda: jaxvr.Analytic("draft"), 1e-5, 1e-5, variant=True),
+    Entry("PartialPreIntegration", jaxvr.PartialPreIntegration, 1e-8, 1e-7),
+    Entry("texture", lambda: jaxvr.PartialPreIntegration(crossings="texture"), 1e-8, 1e-7),
+    Entry("gamma", lambda: jaxvr.PartialPreIntegration(512, "bilinear"), 1e-6, 1e-3, variant=True),
+    Entry("PreIntegration", lambda: jaxvr.PreIntegration(_SMALL), 0.1, 0.4),
+    Entry("logarithmic", lambda: jaxvr.PreIntegration(_SMALL, "log"), 0.1, 0.4, variant=True),
     Entry("Quadrature", lambda: jaxvr.Quadrature(samples=16)),
+    Entry("trapezoid", lambda: jaxvr.Quadrature("trapezoid", 8), 1e-3, 3e-3, variant=True),
+    Entry("riemann", lambda: jaxvr.Quadrature("riemann", 8), 1e-3, 3e-3, variant=True),
+    Entry("AverageColor", jaxvr.AverageColor, 0.3, 0.8),
+    Entry("ConstantExtinction", jaxvr.ConstantExtinction, 0.3, 0.8, variant=True),
 ]
 
 ADJOINTS = [
@@ -75,10 +95,11 @@ def camera_of(dtype: str) -> jaxvr.Camera:
 
 def combinations() -> Iterator[tuple[Entry, Entry, Entry, str]]:
     """All with all on point data, and all tracers and adjoints on the other kinds of field, which
-    integrators do not see."""
+    integrators do not see. (`Recorded`, the tracer of `shade`, has its own test.)"""
     for tracer in TRACERS:
         for adjoint in ADJOINTS:
             for integrator in INTEGRATORS:
-                yield tracer, integrator, adjoint, "point"
+                if not integrator.variant:
+                    yield tracer, integrator, adjoint, "point"
             for mesh in MESHES[1:]:
                 yield tracer, INTEGRATORS[0], adjoint, mesh

@@ -70,7 +70,8 @@ def _is_mpl(node) -> bool:
 
 PUBLIC = """
 TetMesh read_mesh write_mesh read_plot3d Camera TransferFunction render render_rays trace
-shade fit psnr ssim datasets Analytic Quadrature RayCast Over Replay Direct Forward check
+shade fit psnr ssim datasets Analytic PartialPreIntegration PreIntegration Quadrature AverageColor
+ConstantExtinction RayCast Over Replay Direct Forward check
 """.split()
 
 

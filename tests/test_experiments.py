@@ -7,10 +7,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import jaxvr
-from experiments import demo, fit_transfer
+from experiments import (
+    demo,
+    fit_transfer,
+    full_vs_partial,
+    log_table,
+    preintegration_build,
+    quantised_table,
+)
 
 
 def demo_psnr(folder: Path) -> float:
@@ -28,7 +36,54 @@ def fit_transfer_psnr(folder: Path) -> float:
     return report["schedules"]["decay"]["held_out"][0]["psnr"]
 
 
-EXPERIMENTS = [(demo_psnr, 25, 200), (fit_transfer_psnr, 25, 200)]
+def preintegration_build_gain(folder: Path) -> float:
+    """How many times smaller the mean error of halves is than that of slices one by one."""
+    report = preintegration_build.main(["--tiny", "--out", str(folder)])
+    assert (folder / "preintegration_build.png").stat().st_size > 0
+    assert report["wait"][0]["compilations"] == 2  # of prepare and of its gradient, once each
+    means = {row["build"]: row["mean error"] for row in report["build"]}
+    return means["linear, one by one"] / means["linear, halves"]
+
+
+def log_table_gain(folder: Path) -> float:
+    """How many times smaller the rms error is with logarithmic lengths, on a mesh whose cells get
+    many times thinner from one end to the other."""
+    mesh = jaxvr.datasets.heat_sink(fins=2)  # the shapes of the demo: compiled already
+    x, y, z = np.asarray(mesh.points).T
+    mesh = mesh.replace(points=np.stack([x, y, z * (z / z.max()) ** 2], 1))
+    report = log_table.run(
+        mesh, folder, size=16, nodes=128, slices=(8,), shown=8, functions=("shells",)
+    )
+    assert (folder / "log_table_shells.png").stat().st_size > 0
+    rms = {row["table"]: row["rms"] for row in report["transfer"]["shells"]}
+    return rms["linear"] / rms["log"]
+
+
+def quantised_table_gain(folder: Path) -> float:
+    """How many times smaller the error of rounding is with 16 bits than with 8: up to 257."""
+    report = quantised_table.main(["--tiny", "--out", str(folder)])
+    assert (folder / "quantised_table_log.png").stat().st_size > 0
+    rms = {row["bits"]: row["rms"] for row in report["tables"] if row["against"] == "float"}
+    return rms[8] / rms[16]
+
+
+def full_vs_partial_error(folder: Path) -> float:
+    """The largest error of partial pre-integration, where a full table of 16 nodes is useless."""
+    report = full_vs_partial.main(["--tiny", "--out", str(folder)])
+    assert (folder / "full_vs_partial.png").stat().st_size > 0
+    largest = {row["integrator"]: row["max"] for row in report["errors"]}
+    assert largest["full, 128^3"] > 0.01
+    return largest["partial, bicubic 128^2"]
+
+
+EXPERIMENTS = [
+    (demo_psnr, 25, 200),
+    (fit_transfer_psnr, 25, 200),
+    (preintegration_build_gain, 1.2, 20),
+    (log_table_gain, 2, 100),
+    (quantised_table_gain, 100, 300),
+    (full_vs_partial_error, 0, 2e-6),
+]
 
 
 @pytest.mark.parametrize(

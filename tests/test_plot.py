@@ -61,6 +61,7 @@ def test_figures_are_drawn(tmp_path):
         plot.comparison([a, b, a], ["a", "b", "c"], background=(1, 1, 1)),
         plot.difference(a, b, title="a - b"),
         plot.difference(a, a),
+        plot.against([a, b], b, ["a", "b", "reference"], window=(1, 2, 3)),
         plot.plot_transfer(jump),
         plot.plot_transfer(jump, reference=jump.with_points(5)),
         plot.plot_transfer(nothing),
@@ -88,6 +89,17 @@ def test_difference_states_its_scale():
         plot.comparison([a, b], ["a"])
     with pytest.raises(ValueError, match="at least one"):
         plot.comparison([])
+
+
+def test_against_has_one_scale_and_the_sign_of_picture_less_reference():
+    dark, bright = np.zeros((4, 5, 3)), np.full((4, 5, 3), 0.5)
+    axes = plot.against([dark, bright], bright, ["dark", "bright", "reference"]).axes
+    first, second = axes[3].images[0], axes[4].images[0]
+    assert first.get_clim() == second.get_clim() == (-0.5, 0.5)
+    np.testing.assert_array_equal(first.get_array(), -0.5)
+    np.testing.assert_array_equal(second.get_array(), 0)
+    with pytest.raises(ValueError, match="1 images and 1 titles"):
+        plot.against([dark], bright, ["dark"])
 
 
 def test_nothing_imports_pyplot_and_only_plot_draws():

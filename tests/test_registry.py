@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax
@@ -38,30 +39,84 @@ def setting(location: str):
     return mesh, args, (*tangents[:2], transfer, tangents[3])
 
 
+ENTRIES = {e.name: e for e in registry.TRACERS + registry.INTEGRATORS + registry.ADJOINTS}
+WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(5, 6, 4)))
+
+
+def directional(image, args, tangents, adjoint: str):
+    """The image, and the derivative of its sum under fixed weights along each of `tangents`: the
+    numbers on which forward and reverse mode must agree."""
+
+    def forward(args, tangent):
+        return jax.jvp(image, (args,), (tangent,))
+
+    def reverse(args):
+        value, pull = jax.vjp(image, args)
+        return value, pull(WEIGHTS)[0]
+
+    # Compiling is all the time that these tests take; without LLVM's optimiser it is two thirds.
+    options = {"xla_backend_optimization_level": 0}
+    if not ENTRIES[adjoint].reverse:
+        compiled = jax.jit(forward, compiler_options=options)
+        results = [compiled(args, t) for t in tangents]
+        return np.asarray(results[0][0]), [
+            float(jnp.sum(WEIGHTS * change)) for _, change in results
+        ]
+    value, bars = jax.jit(reverse, compiler_options=options)(args)
+
+    def along(tangent):
+        pairs = zip(jax.tree.leaves(bars), jax.tree.leaves(tangent), strict=True)
+        return float(sum(jnp.sum(b * t) for b, t in pairs))
+
+    return np.asarray(value), [along(t) for t in tangents]
+
+
+def only_optical(tangents):
+    """Along colours and extinctions only: what an approximation by a table must get right."""
+    zero = jax.tree.map(jnp.zeros_like, tangents)
+    is_transfer = [isinstance(t, jaxvr.TransferFunction) for t in tangents]
+    which = is_transfer.index(True)
+    positions, colors, extinctions = jax.tree.leaves(tangents[which])
+    kept = jax.tree.unflatten(
+        jax.tree.structure(tangents[which]), [jnp.zeros_like(positions), colors, extinctions]
+    )
+    return (*zero[:which], kept, *zero[which + 1 :])
+
+
 @functools.cache
-def derivative(tracer: str, integrator: str, adjoint: str, location: str):
-    """The image, and its derivative along one direction in all parameters at once, projected on
-    fixed weights: the number on which forward and reverse mode must agree."""
-    by_name = {e.name: e for e in registry.TRACERS + registry.INTEGRATORS + registry.ADJOINTS}
+def derivative(tracer: str, integrator: str, adjoint: str, location: str, everything: bool):
+    """Along all parameters at once, and along colours and extinctions. `everything`: points and
+    camera too, not only values and transfer function."""
     mesh, args, tangents = setting(location)
+    values, points, transfer, camera = args
     nouns = {
-        "tracer": by_name[tracer].make(),
-        "integrator": by_name[integrator].make(),
-        "adjoint": by_name[adjoint].make(),
+        "tracer": ENTRIES[tracer].make(),
+        "integrator": ENTRIES[integrator].make(),
+        "adjoint": ENTRIES[adjoint].make(),
     }
 
     def image(args):
-        values, points, transfer, camera = args
-        return jaxvr.render(mesh.replace(values=values, points=points), camera, transfer, **nouns)
+        values, transfer, *geometry = args
+        at, seen_by = geometry or (points, camera)
+        return jaxvr.render(mesh.replace(values=values, points=at), seen_by, transfer, **nouns)
 
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=(5, 6, 4)))
-    if by_name[adjoint].reverse:
-        value, pull = jax.vjp(image, args)
-        (bars,) = pull(weights)
-        pairs = zip(jax.tree.leaves(bars), jax.tree.leaves(tangents), strict=True)
-        return np.asarray(value), float(sum(jnp.sum(b * t) for b, t in pairs))
-    value, tangent = jax.jvp(image, (args,), (tangents,))
-    return np.asarray(value), float(jnp.sum(weights * tangent))
+    order = (0, 2, 1, 3) if everything else (0, 2)
+    args, tangents = tuple(args[i] for i in order), tuple(tangents[i] for i in order)
+    return directional(image, args, (tangents, only_optical(tangents)), adjoint)
+
+
+def compare(found, same_integrator, exact, entry):
+    """All adjoints agree with `Direct`, and all integrators with `Analytic`, as far as they say."""
+    image, slopes = found
+    assert np.isfinite(image).all() and image[..., 3].max() > 0.3
+    assert np.allclose(image, same_integrator[0], atol=1e-12)
+    assert slopes == pytest.approx(same_integrator[1], rel=1e-9)
+    if entry.error is None:
+        assert np.allclose(image, exact[0], atol=1e-11)
+        assert slopes[1] == pytest.approx(exact[1][1], rel=1e-9)
+    else:
+        assert np.allclose(image, exact[0], atol=entry.error)
+        assert slopes[1] == pytest.approx(exact[1][1], rel=entry.slope)
 
 
 @pytest.mark.parametrize(
@@ -70,11 +125,37 @@ def derivative(tracer: str, integrator: str, adjoint: str, location: str):
     ids=lambda x: x if isinstance(x, str) else x.name,
 )
 def test_same_image_and_gradient(tracer, integrator, adjoint, location):
-    image, slope = derivative(tracer.name, integrator.name, adjoint.name, location)
-    want_image, want_slope = derivative("RayCast", "Analytic", "Direct", location)
-    assert np.isfinite(image).all() and image[..., 3].max() > 0.3
-    assert np.allclose(image, want_image, atol=1e-11)
-    assert slope == pytest.approx(want_slope, rel=1e-9)
+    everything = integrator.name == "Analytic"  # integrators do not see geometry
+    found = derivative(tracer.name, integrator.name, adjoint.name, location, everything)
+    same = derivative(tracer.name, integrator.name, "Direct", location, everything)
+    exact = derivative("RayCast", "Analytic", "Direct", location, everything)
+    compare(found, same, exact, integrator)
+
+
+@functools.cache
+def shaded(integrator: str, adjoint: str):
+    """Traced segments: derivatives with respect to their scalars and lengths too."""
+    mesh, (_, _, transfer, camera), tangents = setting("point")
+    segments = jaxvr.trace(mesh, camera)
+    rng = np.random.default_rng(3)
+    args = (segments.scalar, segments.length, transfer)
+    moves = [jnp.asarray(rng.normal(size=x.shape)) for x in args[:2]]
+    nouns = {"integrator": ENTRIES[integrator].make(), "adjoint": ENTRIES[adjoint].make()}
+
+    def image(args):
+        scalar, length, transfer = args
+        replaced = dataclasses.replace(segments, scalar=scalar, length=length)
+        return jaxvr.shade(replaced, transfer, **nouns)
+
+    tangents = (*moves, tangents[2])
+    return directional(image, args, (tangents, only_optical(tangents)), adjoint)
+
+
+@pytest.mark.parametrize("adjoint", registry.ADJOINTS, ids=lambda x: x.name)
+@pytest.mark.parametrize("integrator", registry.INTEGRATORS, ids=lambda x: x.name)
+def test_same_shaded_image_and_gradient(integrator, adjoint):
+    found = shaded(integrator.name, adjoint.name)
+    compare(found, shaded(integrator.name, "Direct"), shaded("Analytic", "Direct"), integrator)
 
 
 @pytest.mark.parametrize("location", registry.MESHES)
@@ -82,6 +163,6 @@ def test_float32_follows_float64(location):
     mesh = registry.mesh_of(location, "float32")
     image = jaxvr.render(mesh, registry.camera_of("float32"), registry.transfer_of("float32"))
     assert image.dtype == jnp.float32
-    want, _ = derivative("RayCast", "Analytic", "Direct", location)
+    want, _ = derivative("RayCast", "Analytic", "Direct", location, True)
     # Camera, points and field are rounded too: this is not the error of the renderer.
     assert np.max(np.abs(np.asarray(image) - want)) < 2e-5

@@ -15,10 +15,10 @@ stay between positive bounds on the whole domain, over coordinates in which they
     f_1 = (1 + q)^2 B_1,       f_2 = (1 + q)^3 B_2,              w_back = a B_1 / 2 + b B_2.
 
 a = rho q and b = (1 - rho)^2 q^2 are polynomials in (rho, q), so nothing is singular at thin slabs,
-and f_k has an expansion in 1 / q at thick ones. As both are positive, w_back and its derivatives
-have a bounded *relative* error. A tensor-product cubic spline interpolates (de Boor 1978, chapter
-XVII); derivatives come from the moments in closed form, not from the spline's own slope, which
-would have the infinite slope of sqrt(b) at b = 0.
+and f_k has an expansion in 1 / q at thick ones. As both are positive, w_back has a bounded
+*relative* error, and so have the moments that its derivatives consist of. A tensor-product cubic
+spline interpolates (de Boor 1978, chapter XVII); derivatives come from the moments in closed form,
+not from the spline's own slope, which would have the infinite slope of sqrt(b) at b = 0.
 """
 
 from __future__ import annotations
@@ -123,7 +123,6 @@ def _spline_weights(t: Array) -> tuple[Array, ...]:
 def smooth_moments(a: Array, b: Array, size: int) -> tuple[Array, Array]:
     """B_1 and B_2 from the splines; not for differentiation: see `smooth_weights`."""
     table = jnp.asarray(moment_splines(size), a.dtype)
-    a, b = jnp.clip(a, 0, 1e15), jnp.clip(b, 0, 1e30)
     q = a + jnp.sqrt(b)
     rho = a / jnp.where(q > 0, q, 1)
     per = 1 / (1 + q)
@@ -141,14 +140,20 @@ def smooth_moments(a: Array, b: Array, size: int) -> tuple[Array, Array]:
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def smooth_weights(a: Array, b: Array, size: int) -> tuple[Array, Array]:
     """(alpha, w_back) of a slab as `moments.emission_weights` has them, from the smooth table."""
+    a, b = _clip(a, b)
     return _weights(a, b, smooth_moments(a, b, size))
 
 
 @smooth_weights.defjvp
 def _smooth_weights_jvp(size, primals, tangents):
-    a, b = primals
+    a, b = _clip(*primals)
     b1, b2 = smooth_moments(a, b, size)
     return _weights(a, b, (b1, b2)), weights_tangent(a, b, (None, b1, b2), tangents)
+
+
+def _clip(a: Array, b: Array) -> tuple[Array, Array]:
+    """To where squares and cubes are finite in float32; beyond, all weights are at their limits."""
+    return jnp.clip(a, 0, 1e15), jnp.clip(b, 0, 1e30)
 
 
 def _weights(a: Array, b: Array, moments: tuple[Array, Array]) -> tuple[Array, Array]:

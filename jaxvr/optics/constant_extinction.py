@@ -31,12 +31,11 @@ def _back_weight(depth: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class ConstantExtinction(AbstractEndIntegrator):
-    """The mean of a segment's two extinctions all along it, and its colour linear: exact for that.
+    """Extinction constant along a segment, at the mean of its two ends, and colour linear.
 
-    The optical model of Wilhelms and Van Gelder 1991 and, with the exponential at every pixel, of
-    Stein, Becker and Max 1994. Here to compare with: where extinction rises towards the back it
-    shows too much of the front and the other way round, and peaks of the transfer function that
-    lie between two ends are missed.
+    The extinction is that of Stein, Becker and Max 1994; the colour's integral is exact for it.
+    Here to compare with: where extinction rises towards the back, too much of the front is shown,
+    and the other way round; peaks of the transfer function between the two ends are missed.
     """
 
     def weights(self, a, b):

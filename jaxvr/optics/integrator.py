@@ -123,7 +123,10 @@ class AbstractSlabIntegrator(AbstractIntegrator):
         return nodes_of(transfer, dtype)
 
     def start(self, table, scalar):
-        return Cursor(jax.lax.stop_gradient(scalar), locate(table.position, scalar))
+        scalar = jax.lax.stop_gradient(scalar)
+        if table.texture is not None:  # found there, at each step
+            return Cursor(scalar, jnp.zeros(scalar.shape, jnp.int32))
+        return Cursor(scalar, locate(table.position, scalar))
 
     def step(self, table, segment, cursor):
         wanted = jnp.any(segment.length > 0)

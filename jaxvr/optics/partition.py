@@ -111,22 +111,28 @@ def look_up(nodes: Nodes, segment: Segment, cursor: Cursor) -> Cursor:
     Their texture over (s_front, s_back) stores the next control point and the one behind it, for
     the case that s_front stands at the first already, or the loop would not end. Which control
     point is next depends on s_back only in so far as it tells the direction, and the one behind it
-    is the next index: so a row of slabs holds the same information. Where several control points
-    share a texel both are wrong. Then the cursor's own slab stays.
+    is the next index: so a row of slabs holds the same information.
+
+    Where several control points share a texel, both are wrong, and at a jump the loop would not end
+    all the same. So the texture is believed where the cursor is strictly inside of the slab that it
+    names; else the cursor's own slab stays, if it is a possible one.
     """
     assert nodes.texture is not None
     count, size = nodes.position.shape[0], nodes.texture.shape[0]
     low, high = _hold(nodes.position[0]), _hold(nodes.position[-1])
-    width = high - low
-    texel = (cursor.scalar - low) * (size / jnp.where(width > 0, width, 1))
+    width, scalar = high - low, cursor.scalar
+    texel = (scalar - low) * (size / jnp.where(width > 0, width, 1))
     slab = nodes.texture[jnp.clip(texel.astype(jnp.int32), 0, size - 1)]
-    rising = _hold(segment.back) >= _hold(segment.front)
     floor, ceiling = _borders(nodes, slab, count)
-    passed = jnp.where(rising, cursor.scalar >= ceiling, cursor.scalar <= floor)
+    inside = (scalar > floor) & (scalar < ceiling)
+    rising = _hold(segment.back) >= _hold(segment.front)
+    passed = jnp.where(rising, scalar >= ceiling, scalar <= floor)
     slab = slab + jnp.where(passed, jnp.where(rising, 1, -1), 0).astype(jnp.int32)
     floor, ceiling = _borders(nodes, slab, count)
-    right = (cursor.scalar >= floor) & (cursor.scalar <= ceiling)
-    return Cursor(cursor.scalar, jnp.where(right, slab, cursor.slab))
+    right = (scalar >= floor) & (scalar <= ceiling)
+    floor, ceiling = _borders(nodes, cursor.slab, count)
+    possible = (scalar >= floor) & (scalar <= ceiling)
+    return Cursor(scalar, jnp.where(inside | (right & ~possible), slab, cursor.slab))
 
 
 def _borders(nodes: Nodes, slab: Array, count: int) -> tuple[Array, Array]:

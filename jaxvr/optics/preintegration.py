@@ -46,21 +46,22 @@ class PreIntegration(AbstractWholeIntegrator):
     """One trilinear lookup a segment, however many control points it crosses.
 
     size: nodes over the front scalar and over the back scalar, and slices over length.
-    scale: "linear" slices, evenly spaced; or "log", where each is 2^(1/p) times as long as the one
-      before it, and the first of them follows 0: equation 1 of Kraus et al. 2004, whose p is 1. Here
-      p = ceil((n_l - 2) / 16), so that larger tables get finer, not ever shorter.
+    scale: "linear" slices, evenly spaced, or "log", where each is 2^(1/p) times as long as the one
+      before it and the first of them follows 0. With p = 1 that is equation 1 of Kraus et al. 2004;
+      here p = ceil((n_l - 2) / 16), so that larger tables get finer, not ever shorter.
     incremental: whether slices are composed of earlier ones, or all integrated exactly (see
       `jaxvr.optics.preintegration_table`); both are differentiable.
     schedule: how a linear table is composed, "halves" or, as in the papers, "one by one", which is
-      several times less accurate.
+      several times less accurate in the mean.
     bits: None, or 8 or 16 to round the finished table to so many bits a channel, colours clipped
       to [0, 1], as graphics hardware of the time did. Derivatives ignore the rounding.
 
-    The error is that of the table: control points and peaks that fall between two nodes are blurred,
-    and segments much shorter than a linear table's first slice lose contrast (Kraus et al., Figure
+    The error is that of the table. Control points and peaks between two nodes are blurred;
+    on a linear scale, segments much shorter than the first slice lose colour (Kraus et al., Figure
     10). Opacity saturates at 1 minus one rounding. Memory: 16 bytes an entry in float32, so 34 MB
-    for the default size, and twice that for a gradient with respect to the transfer function, which
-    goes through the table and its making. The derivative is that of the interpolated table.
+    for the default size, and several times that for a gradient with respect to the transfer
+    function, which goes through the table and its making. The derivative is that of the
+    interpolated table; where a segment leaves the control points it is cut at fixed parameters.
 
     `slab` takes the two ends as nodes of a table whose longest length is the longest one given.
 
@@ -120,7 +121,8 @@ class PreIntegration(AbstractWholeIntegrator):
         low, high = nodes.position[0], nodes.position[-1]
 
         def over(n):
-            return low + (high - low) * jnp.arange(n).astype(longest.dtype) / (n - 1)
+            t = jnp.arange(n).astype(longest.dtype) / (n - 1)
+            return low * (1 - t) + high * t  # ends at `high` exactly
 
         scalars = over(n_f), over(n_b)
         lengths = self._length(jnp.arange(1, n_l), longest)
@@ -176,7 +178,8 @@ class PreIntegration(AbstractWholeIntegrator):
         wanted = jnp.any(segment.length > 0)
         way, before, after = stage(wanted, self._ways, frame, segment)
         inside = stage(wanted, _trilinear, rows, way)
-        alpha = jnp.clip(inside[3], 0, 1 - jnp.finfo(inside.dtype).epsneg)
+        most = 1 - jnp.finfo(inside.dtype).epsneg
+        alpha = jnp.where(inside[3] < most, inside[3], most)
         # In front of the table's part, and behind it.
         (color, depth), (far_color, far_depth) = before, after
         rgb = inside[:3] + ((1 - alpha) * opacity(far_depth))[None] * far_color
@@ -199,8 +202,7 @@ def _trilinear(rows: Array, way: tuple[Array, Array, Array]) -> Array:
 
 def _rounded(table: Array, bits: int) -> Array:
     top = 2**bits - 1
-    clipped = jnp.clip(table, 0, 1)
-    return clipped + lax.stop_gradient(jnp.round(clipped * top) / top - clipped)
+    return table + lax.stop_gradient(jnp.round(jnp.clip(table, 0, 1) * top) / top - table)
 
 
 def _node(scalar: Array, frame: Frame, size: int) -> tuple[Array, Array]:

@@ -45,7 +45,7 @@ def exact_slice(nodes: Nodes, front: Array, back: Array, length: Array) -> Array
     change = back - front
     flat = change == 0
     per_change = 1 / jnp.where(flat, 1, change)
-    last = nodes.position[-1]
+    first, last = nodes.position[0], nodes.position[-1]
 
     def body(carry, slab):
         rgb, depth = carry
@@ -53,9 +53,7 @@ def exact_slice(nodes: Nodes, front: Array, back: Array, length: Array) -> Array
         width = high - low
         per_width = jnp.where(width > 0, 1 / jnp.where(width > 0, width, 1), 0)
         s_0, s_1 = (jnp.clip(s, low, high) for s in (front, back))
-        holds = (front >= low) & (
-            (front < high) | ((front == high) & (high == last) & (low < high))
-        )
+        holds = ((front >= low) | (low == first)) & ((front < high) | (high == last)) & (low < high)
         share = jnp.where(flat, holds.astype(front.dtype), (s_1 - s_0) * per_change) * length
         color = [
             start[:, None] + ((s - low) * per_width)[None] * (end - start)[:, None]

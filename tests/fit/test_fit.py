@@ -210,3 +210,12 @@ def test_bad_operands(scene, change, message):
 def test_bad_keywords(scene, keywords, message):
     with pytest.raises(ValueError, match=message):
         scene.fit(**({"iterations": 1} | keywords))
+
+
+def test_fits_through_a_pre_integrated_table(scene):
+    """The transfer function is fitted through the making of the table; judged by `Analytic`."""
+    table = jaxvr.PreIntegration((48, 48, 12), schedule="one by one")
+    result = scene.fit(iterations=60, rays=None, integrator=table)
+    assert result.loss_history[-1] < 0.02 * result.loss_history[0]
+    image = jaxvr.shade(scene.held_segments, result.transfer)
+    assert jaxvr.psnr(np.asarray(image), scene.unseen) > 25

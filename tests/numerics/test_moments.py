@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxvr.numerics import moments
+from jaxvr.numerics import moments, rules
 
 EDGES = [0.0, 1e-30, 1e-6, 1e-2, 0.5, 3.0, 25.0, 60.0, 800.0, 1e4, 1e6]
 
@@ -86,3 +86,47 @@ def test_derivative_of_opacity_keeps_its_digits():
 def test_psi_of_a_constant_slab():
     a = jnp.array([1e-3, 1.0, 50.0])
     assert np.allclose(moments.psi(a, a), -np.expm1(-a) / a, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "rule, value, by_a, by_b, back",
+    [(rules.FAST, 8.5e-6, 2.3e-5, 9.2e-5, 1.6e-5), (rules.DRAFT, 4.7e-4, 1.3e-3, 3.1e-3, 4.3e-4)],
+    ids=["fast", "draft"],
+)
+def test_small_rules_err_as_they_say(rule, value, by_a, by_b, back, dtype):
+    """Relative errors of psi and its slopes, and what is left of them in the weights of colours:
+    alpha is exact whatever the rule, and w_back errs relative to 1."""
+    a, b = (jnp.asarray(x.astype(dtype)) for x in pairs())
+
+    def all_of(a, b, rule):
+        psi, pull = jax.vjp(lambda a, b: moments.bernstein_moments(a, b, 0, rule)[0], a, b)
+        weights, by = jax.vjp(lambda a, b: moments.emission_weights(a, b, rule)[1], a, b)
+        alpha = moments.emission_weights(a, b, rule)[0]
+        slopes = *pull(jnp.ones_like(a)), *by(jnp.ones_like(a))
+        return jnp.stack([psi, *slopes[:2], alpha, weights, *slopes[2:]])
+
+    all_of = jax.jit(all_of, static_argnums=2)
+    got = np.asarray(all_of(a, b, rule), np.float64)
+    want = np.asarray(all_of(a.astype("float64"), b.astype("float64"), None))
+    wrong = np.abs(got - want)
+    relative = np.max(wrong[:3] / (np.abs(want[:3]) + 1e-30), axis=1)
+    rounding = 1e-7 if dtype == "float32" else 0
+    assert np.all(relative <= np.array([value, by_a, by_b]) + rounding)
+    assert np.all(relative >= 0.5 * np.array([value, by_a, by_b]))  # it is this rule
+    exact = -np.expm1(-(np.asarray(a, np.float64) + np.asarray(b, np.float64)) / 2)
+    assert np.allclose(got[3], exact, rtol=2e-15 + 4 * rounding, atol=0)
+    assert np.max(wrong[4]) < back
+    assert np.all((got[4] >= 0) & (got[4] <= got[3]))
+    # slopes of w_back are half those of the moments, beside the transmittance
+    assert np.all(wrong[5] <= (by_a + 3 * rounding) * np.abs(want[1]) + 2 * rounding + 1e-15)
+    assert np.all(wrong[6] <= (by_b + 3 * rounding) * np.abs(want[2]) + 2 * rounding + 1e-15)
+
+
+@pytest.mark.parametrize("rule", [rules.FAST, rules.DRAFT], ids=["fast", "draft"])
+def test_small_rules_are_exact_for_thin_slabs(rule):
+    a, b = jnp.array([0.0, 1e-9, 0.0, 2e-9]), jnp.array([0.0, 0.0, 1e-9, 1e-9])
+    (alpha, back), pull = jax.vjp(lambda a, b: moments.emission_weights(a, b, rule), a, b)
+    assert np.allclose(alpha, (a + b) / 2, rtol=2e-9, atol=0)
+    assert np.allclose(back, a / 6 + b / 3, rtol=2e-9, atol=0)
+    by_a, by_b = pull((jnp.zeros(4), jnp.ones(4)))
+    assert np.allclose(by_a, 1 / 6, rtol=1e-8) and np.allclose(by_b, 1 / 3, rtol=1e-8)

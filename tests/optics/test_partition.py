@@ -10,12 +10,7 @@ from jax.test_util import check_grads
 
 from jaxvr.optics import Analytic, Quadrature, Segment, TransferFunction
 from jaxvr.optics.partition import Cursor
-
-TF = TransferFunction(
-    np.array([0.1, 0.3, 0.5, 0.5, 0.8]),
-    np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0.2, 0.5, 1.0]]),
-    np.array([0.5, 2.0, 1.0, 4.0, 0.3]),
-)
+from tests.optics.segments import CASES, TF, integrate, segment_of
 
 
 def sampled(tf: TransferFunction, front, back, length, n=20001):
@@ -26,46 +21,6 @@ def sampled(tf: TransferFunction, front, back, length, n=20001):
     before = np.concatenate([[0], np.cumsum(depth)[:-1]])
     weight = np.exp(-before) * -np.expm1(-depth)
     return (weight[:, None] * color).sum(0), depth.sum()
-
-
-def integrate(integrator, tf, segment, start=None):
-    """Whole segments (R,), piece after piece: rgb (3, R) and depth (R,)."""
-    table = integrator.prepare(tf, segment.front.dtype, jnp.max(segment.length))
-    cursor = integrator.start(table, segment.front) if start is None else start
-
-    def body(carry, _):
-        cursor, rgb, depth, done = carry
-        color, tau, new, finished, _ = integrator.step(table, segment, cursor)
-        rgb = jnp.where(done[None], rgb, rgb + jnp.exp(-depth)[None] * color)
-        depth = jnp.where(done, depth, depth + tau)
-        keep = jax.tree.map(lambda a, b: jnp.where(done, b, a), new, cursor)
-        return (keep, rgb, depth, done | finished), None
-
-    size = segment.front.shape
-    zero = jnp.zeros(size, segment.front.dtype)
-    start = (cursor, jnp.zeros((3, *size), zero.dtype), zero, jnp.zeros(size, bool))
-    (_, rgb, depth, done), _ = jax.lax.scan(body, start, length=16)
-    return rgb, depth, done
-
-
-CASES = [
-    (0.2, 0.25, 1.0),  # inside a slab
-    (0.0, 1.0, 2.0),  # through everything, upwards
-    (1.0, 0.0, 2.0),  # and downwards
-    (0.4, 0.4, 1.0),  # constant
-    (0.5, 0.5, 1.0),  # constant at the jump: the upper side
-    (0.05, 0.02, 3.0),  # below all control points
-    (0.9, 2.0, 3.0),  # above all of them
-    (0.3, 0.5, 1.0),  # from a control point up to the jump
-    (0.5, 0.3, 1.0),  # from the jump down
-    (0.45, 0.55, 5.0),  # across the jump
-    (0.3, 0.3 + 1e-7, 1.0),  # hardly any change, at a control point
-    (0.1, 0.8, 0.0),  # no length
-]
-
-
-def segment_of(cases, dtype):
-    return Segment(*(jnp.asarray(x, dtype) for x in np.array(cases).T))
 
 
 @pytest.mark.parametrize(
