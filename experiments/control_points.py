@@ -11,7 +11,7 @@ point. Tasks take turns; medians of one run.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,11 @@ from experiments.common import diagonal, write_json
 from experiments.speed import camera_of, median_of
 
 PIECES = (2, 10, 64, 255)
+INTEGRATORS = {
+    "Analytic": jaxvr.Analytic(),
+    "texture": jaxvr.PartialPreIntegration(crossings="texture"),
+    "PreIntegration": jaxvr.PreIntegration(),
+}
 
 
 def transfer_of(mesh: jaxvr.TetMesh, pieces: int) -> jaxvr.TransferFunction:
@@ -47,14 +52,9 @@ def run(
     size: int,
     repeat: int,
     pieces: Sequence[int] = PIECES,
-    table: int = 128,
+    integrators: Mapping[str, Any] = INTEGRATORS,
 ) -> dict[str, Any]:
     """Seconds and pieces a segment, {mesh: {pieces: {...}}}; prints a table for each mesh."""
-    integrators = {
-        "Analytic": jaxvr.Analytic(),
-        "texture": jaxvr.PartialPreIntegration(crossings="texture"),
-        "PreIntegration": jaxvr.PreIntegration((table, table, table)),
-    }
     result: dict[str, Any] = {}
     for title, mesh in meshes.items():
         camera = camera_of(mesh, size)

@@ -25,8 +25,8 @@ import jaxvr
 from experiments.common import write_json
 from experiments.speed import camera_of, median_of, transfer_of
 
-# A batch of rays, and how many of them one timing runs through.
-LANES, BATCHES = 512, 2048
+# How many batches of rays one timing of slabs runs through, and of how many rays each.
+LANES = (2048, 512)
 
 
 # Whole renders are timed for those that one might choose.
@@ -83,11 +83,12 @@ def slab_errors(integrators: dict[str, Any], vectors: Any) -> dict[str, float]:
     return errors
 
 
-def slab_seconds(integrators: dict[str, Any], repeat: int) -> dict[str, dict[str, float]]:
+def slab_seconds(
+    integrators: dict[str, Any], repeat: int, lanes: tuple[int, int] = LANES
+) -> dict[str, dict[str, float]]:
     """Nanoseconds for the weights of one slab, and with their derivatives, where there are any."""
     rng = np.random.default_rng(0)
-    shape = (BATCHES, LANES)
-    a, b = (jnp.asarray(rng.exponential(1, shape), jnp.float32) for _ in range(2))
+    a, b = (jnp.asarray(rng.exponential(1, lanes), jnp.float32) for _ in range(2))
 
     def in_batches(f):
         return jax.jit(lambda a, b: lax.map(lambda x: f(*x), (a, b)))
@@ -111,10 +112,11 @@ def slab_seconds(integrators: dict[str, Any], repeat: int) -> dict[str, dict[str
     }
 
 
-def shading(segments: jaxvr.Segments, integrator: Any, weights: Any):
-    """A function of (transfer, scalar): the image, and the gradients of its weighted sum."""
+def shading(integrator: Any):
+    """A function of (transfer, scalar, segments, weights): the image, and the gradients of its
+    weighted sum with respect to the first two; `scalar` takes the place of that of `segments`."""
 
-    def loss(transfer, scalar):
+    def loss(transfer, scalar, segments, weights):
         image = jaxvr.shade(
             dataclasses.replace(segments, scalar=scalar), transfer, integrator=integrator
         )
@@ -132,8 +134,8 @@ def truth_of(segments: jaxvr.Segments, transfer: Any, weights: np.ndarray):
             length=jnp.asarray(np.asarray(segments.length), jnp.float64),
         )
         transfer = transfer.astype("float64")
-        (_, image), bars = shading(double, jaxvr.Analytic(), jnp.asarray(weights, jnp.float64))(
-            transfer, double.scalar
+        (_, image), bars = shading(jaxvr.Analytic())(
+            transfer, double.scalar, double, jnp.asarray(weights, jnp.float64)
         )
         return np.asarray(image), jax.tree.map(np.asarray, bars)
 
@@ -155,8 +157,8 @@ def on_image(
     rows: dict[str, dict[str, float]] = {}
     tasks: dict[str, Callable[[], Any]] = {}
     for name, integrator in integrators.items():
-        gradient = shading(segments, integrator, weights)
-        (_, found), slopes = gradient(transfer, segments.scalar)
+        gradient = shading(integrator)
+        (_, found), slopes = gradient(transfer, segments.scalar, segments, weights)
         table = jax.jit(lambda t, i=integrator: i.prepare(t, jnp.float32, jnp.float32(1)))
         rows[name] = {
             "error": float(np.abs(found - image).max()),
@@ -171,7 +173,9 @@ def on_image(
         shade = jax.jit(lambda t, s, i=integrator: jaxvr.shade(s, t, integrator=i))
         tasks[f"{name}|build"] = lambda f=table: f(transfer)
         tasks[f"{name}|shade"] = lambda f=shade: f(transfer, segments)
-        tasks[f"{name}|gradient"] = lambda f=gradient: f(transfer, segments.scalar)
+        tasks[f"{name}|gradient"] = lambda f=gradient: f(
+            transfer, segments.scalar, segments, weights
+        )
         if name in RENDERED:
             tasks[f"{name}|render"] = lambda i=integrator: jaxvr.render(
                 mesh, camera, transfer, integrator=i
@@ -196,6 +200,7 @@ def run(
     repeat: int,
     vectors: Any = None,
     integrators: dict[str, Any] | None = None,
+    lanes: tuple[int, int] = LANES,
 ) -> dict[str, Any]:
     """All numbers: {"slab": {integrator: ...}, mesh: {integrator: ...}}; prints the tables.
 
@@ -207,7 +212,7 @@ def run(
     if vectors is not None:
         for name, error in slab_errors(integrators, vectors).items():
             slab[name]["error"] = error
-    for name, seconds in slab_seconds(integrators, repeat).items():
+    for name, seconds in slab_seconds(integrators, repeat, lanes).items():
         slab[name].update(seconds)
     result: dict[str, Any] = {"slab": slab}
     for title, mesh in meshes.items():

@@ -199,7 +199,7 @@ def shade(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _render(pipeline, adjoint, volume, camera, transfer, background):
-    # Under a user's own jit the operands may be constants: XLA must not compute with them itself.
+    # Under a user's own jit operands may be constants: XLA must not compute with them itself.
     volume, camera = lax.optimization_barrier((volume, camera))
     height, width = camera.height, camera.width
     origins, directions = (_tile(x) for x in camera.rays())
@@ -220,6 +220,7 @@ def _render_rays(pipeline, adjoint, volume, origins, directions, transfer, backg
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _shade(pipeline, adjoint, segments, transfer, background):
+    segments = lax.optimization_barrier(segments)  # as above
     scene = pipeline.tracer.prepare(segments)
     rays, count = _batches((segments.start[:-1], segments.start[1:]))
     rays = pipeline.tracer.prepare_rays(scene, *rays)

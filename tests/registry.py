@@ -23,7 +23,7 @@ class Entry:
     error: largest difference of an integrator's image from `Analytic`'s in the setting of
     test_registry, whose transfer function has a jump. slope: difference of its derivative with
     respect to colours and extinctions, relative. None for both: equal to rounding. variant: the
-    same code as another entry, but for its weights; crossed with all adjoints in `shade` only.
+    same class as another entry, or almost; crossed with all adjoints in `shade` only.
     """
 
     name: str
@@ -43,7 +43,12 @@ INTEGRATORS = [
     Entry("fast", lambda: jaxvr.Analytic("fast"), 1e-6, 1e-6, variant=True),
     Entry("draft", lambda: jaxvr.Analytic("draft"), 1e-5, 1e-5, variant=True),
     Entry("PartialPreIntegration", jaxvr.PartialPreIntegration, 1e-8, 1e-7),
-    Entry("texture", lambda: jaxvr.PartialPreIntegration(crossings="texture"), 1e-8, 1e-7),
+    Entry(
+        "texture",
+        lambda: jaxvr.PartialPreIntegration(crossings="texture"),
+        *(1e-8, 1e-7),
+        variant=True,
+    ),
     Entry("gamma", lambda: jaxvr.PartialPreIntegration(512, "bilinear"), 1e-6, 1e-3, variant=True),
     Entry("PreIntegration", lambda: jaxvr.PreIntegration(_SMALL), 0.1, 0.4),
     Entry("logarithmic", lambda: jaxvr.PreIntegration(_SMALL, "log"), 0.1, 0.4, variant=True),

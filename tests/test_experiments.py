@@ -12,9 +12,11 @@ import pytest
 
 import jaxvr
 from experiments import (
+    control_points,
     demo,
     fit_transfer,
     full_vs_partial,
+    integrators,
     log_table,
     preintegration_build,
     quantised_table,
@@ -76,6 +78,29 @@ def full_vs_partial_error(folder: Path) -> float:
     return largest["partial, bicubic 128^2"]
 
 
+def integrators_error(folder: Path) -> float:
+    chosen = {"Analytic()": jaxvr.Analytic()}
+    slabs = {k: np.array([0.5, 2.0]) for k in ("tau_f", "tau_b", "l")}
+    slabs |= {k: np.full((2, 3), 0.5) for k in ("C_f", "C_b")} | {
+        "f32_exact_inputs": np.ones(2, bool)
+    }
+    slabs["alpha"] = 1 - np.exp(-slabs["tau_f"] * slabs["l"])
+    slabs["rgb"] = 0.5 * slabs["alpha"][:, None] * np.ones(3)
+    volume = jaxvr.datasets.box((2, 2, 2), jitter=0.2, dtype="float32")
+    report = integrators.run({"box": volume}, 8, 1, slabs, chosen, lanes=(8, 2))
+    assert report["slab"]["Analytic()"]["error"] < 5e-7
+    assert report["box"]["Analytic()"]["extinctions"] < 1e-4
+    return report["box"]["Analytic()"]["error"]
+
+
+def control_points_pieces(folder: Path) -> float:
+    volume = jaxvr.datasets.box((2, 2, 2), jitter=0.2, dtype="float32")
+    chosen = {"Analytic": jaxvr.Analytic()}
+    report = control_points.run({"box": volume}, 8, 1, (10,), chosen)
+    assert report["box"][10]["render Analytic"] > 0
+    return report["box"][10]["pieces"]
+
+
 EXPERIMENTS = [
     (demo_psnr, 25, 200),
     (fit_transfer_psnr, 25, 200),
@@ -83,6 +108,8 @@ EXPERIMENTS = [
     (log_table_gain, 2, 100),
     (quantised_table_gain, 100, 300),
     (full_vs_partial_error, 0, 2e-6),
+    (integrators_error, 1e-9, 1e-6),
+    (control_points_pieces, 1.2, 10),
 ]
 
 

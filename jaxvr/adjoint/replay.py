@@ -38,6 +38,9 @@ from jaxvr.adjoint.base import (
 
 Array = jax.Array
 
+# Numbers in a table whose gradient is summed batch by batch.
+_SMALL_TABLE = 1 << 16
+
 
 @dataclasses.dataclass(frozen=True)
 class Replay(AbstractAdjoint):
@@ -114,14 +117,19 @@ def _backward(pipeline: Pipeline, residuals: Any, cotangents: Any):
             trace, cursor = advance(pipeline, one, march, cursor, finished)
             return March(trace, cursor, pixel), table_bar, trace_bar
 
-        loop = (begin(pipeline, one), table_bar, (scene_bar, rays_bar))
+        # A small table's gradient is summed batch by batch first: a sum of millions of terms in
+        # float32 is then ten times as exact. A large one would cost more to clear than to add to.
+        own = small and integrator.gradient_start(operands.table)
+        loop = (begin(pipeline, one), own if small else table_bar, (scene_bar, rays_bar))
         loop = lax.while_loop(lambda loop: busy(loop[0]), body, loop)
-        _, table_bar, (scene_bar, rays_bar) = loop
+        _, own, (scene_bar, rays_bar) = loop
+        table_bar = jax.tree.map(jnp.add, table_bar, own) if small else own
         return (scene_bar, table_bar), _floats(tracer.rays_cotangent(rays, rays_bar))
 
     first = jax.tree.map(lambda x: x[0], operands.rays)
     scene_bar, _ = tracer.gradient_start(operands.scene, first, (perturbed.scene, perturbed.rays))
     table_bar = integrator.gradient_start(operands.table) if optical else None
+    small = optical and sum(x.size for x in jax.tree.leaves(table_bar)) <= _SMALL_TABLE
     (scene_bar, table_bar), rays_bar = lax.scan(
         batch, (scene_bar, table_bar), (operands.rays, finals, rgba_bar)
     )

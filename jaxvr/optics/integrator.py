@@ -173,8 +173,9 @@ def shade_slab(weights: Weights, piece: Ends) -> tuple[Array, Array]:
     """rgb (3, R), premultiplied, and optical depth (R,) of slabs; `weights` as in
     `AbstractSlabIntegrator`."""
     a, b = piece.front[0] * piece.length, piece.back[0] * piece.length
-    # In kernels of their own, or they are computed again for each channel.
-    w, w_back = stage(jnp.any(piece.length > 0), weights, a, b)
+    # In kernels of their own, or they are computed again for each channel. (Not skipped at length
+    # 0, where the derivative with respect to the length is not 0.)
+    w, w_back = stage(jnp.any(~(piece.length < 0)), weights, a, b)
     color, change = piece.front[1:], piece.back[1:] - piece.front[1:]
     return color * w[None] + change * w_back[None], 0.5 * (a + b)
 

@@ -9,6 +9,7 @@ outside of them has constant colour and extinction, and its part of a segment is
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +67,8 @@ class PreIntegration(AbstractWholeIntegrator):
     `slab` takes the two ends as nodes of a table whose longest length is the longest one given.
 
     Raises:
-      ValueError: for a size below (2, 2, 3), another scale or schedule, or other bits.
+      ValueError: for a size below (2, 2, 3) or above 2^29 entries, another scale or schedule, or
+        other bits.
     """
 
     size: tuple[int, int, int] = (128, 128, 128)
@@ -77,8 +79,11 @@ class PreIntegration(AbstractWholeIntegrator):
 
     def __post_init__(self):
         object.__setattr__(self, "size", tuple(self.size))
-        if len(self.size) != 3 or any(n < least for n, least in zip(self.size, (2, 2, 3))):
-            raise ValueError(f"size must be three numbers from (2, 2, 3) on, but is {self.size}.")
+        whole = len(self.size) == 3 and all(isinstance(n, int) for n in self.size)
+        if not whole or any(n < least for n, least in zip(self.size, (2, 2, 3))):
+            raise ValueError(f"size must be three integers from (2, 2, 3) on, but is {self.size}.")
+        if 4 * math.prod(self.size) >= 2**31:
+            raise ValueError(f"A table of size {self.size} is too large for 32-bit indices.")
         if self.scale not in ("linear", "log"):
             raise ValueError(f"scale must be 'linear' or 'log', but is {self.scale!r}.")
         if self.schedule not in SCHEDULES:

@@ -253,9 +253,11 @@ def test_slab_comes_near_the_exact_one():
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"size": (2, 2)}, "three numbers"),
+        ({"size": (2, 2)}, "three integers"),
         ({"size": (2, 1, 3)}, r"from \(2, 2, 3\) on, but is \(2, 1, 3\)"),
-        ({"size": (2, 2, 2)}, "three numbers"),
+        ({"size": (2, 2, 2)}, "three integers"),
+        ({"size": (8.0, 8, 8)}, "three integers"),
+        ({"size": (1024, 1024, 512)}, "too large for 32-bit"),
         ({"scale": "cubic"}, "scale must be 'linear' or 'log', but is 'cubic'"),
         ({"schedule": "thirds"}, "schedule must be one of .* but is 'thirds'"),
         ({"bits": 12}, "bits must be None, 8 or 16, but is 12"),
