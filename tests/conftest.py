@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -15,6 +16,8 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 DATA = Path(os.environ.get("JAXVR_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
+MANY_MAPS = 20_000
+
 
 @pytest.fixture(scope="session")
 def data_path():
@@ -27,6 +30,17 @@ def data_path():
         return path
 
     return find
+
+
+@pytest.fixture(scope="module", autouse=True)
+def free_compiled_code():
+    """Compiled functions hold memory maps, of which Linux allows a process 65,530: the compiler
+    crashes when there are no more. Frees them between modules once there are many."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(params=["float32", "float64"])
