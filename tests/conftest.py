@@ -16,7 +16,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 DATA = Path(os.environ.get("JAXVR_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
-MANY_MAPS = 20_000
+MANY_MAPS = 40_000
 
 
 @pytest.fixture(scope="session")
@@ -32,10 +32,10 @@ def data_path():
     return find
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def free_compiled_code():
     """Compiled functions hold memory maps, of which Linux allows a process 65,530: the compiler
-    crashes when there are no more. Frees them between modules once there are many."""
+    crashes when there are no more. Frees them between tests once there are many."""
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS:
