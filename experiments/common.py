@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +131,17 @@ def picture_options(description: str | None, arguments: Any) -> argparse.Namespa
     else:
         options.volume = jaxvr.read_mesh(options.mesh, field=options.field, dtype="float32")
     return options
+
+
+def run_on_pictures(
+    run: Callable[..., dict[str, Any]], description: str | None, arguments: Any, tiny: Any
+) -> dict[str, Any]:
+    """`run(volume, out, size=...)` with `picture_options`, or with the keywords `tiny` instead."""
+    options = picture_options(description, arguments)
+    report = run(options.volume, options.out, **(tiny if options.tiny else {"size": options.size}))
+    if options.json:
+        write_json(options.json, report)
+    return report
 
 
 def write_json(path: Any, data: Any) -> Path:

@@ -23,10 +23,9 @@ import jaxvr
 from experiments.common import (
     errors,
     in_float64,
-    picture_options,
+    run_on_pictures,
     spikes,
     table,
-    write_json,
 )
 from jaxvr import plot
 
@@ -88,17 +87,10 @@ def run(
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    options = picture_options(__doc__, arguments)
     jax.config.update("jax_enable_x64", True)
-    keywords: dict[str, Any] = {"size": options.size}
-    if options.tiny:
-        small = {name: INTEGRATORS[name] for name in ("full, 128^3", "partial, bicubic 128^2")}
-        small["full, 128^3"] = jaxvr.PreIntegration((16, 16, 16))
-        keywords = {"size": 16, "integrators": small}
-    report = run(options.volume, options.out, **keywords)
-    if options.json:
-        write_json(options.json, report)
-    return report
+    small = {name: INTEGRATORS[name] for name in ("full, 128^3", "partial, bicubic 128^2")}
+    small["full, 128^3"] = jaxvr.PreIntegration((16, 16, 16))
+    return run_on_pictures(run, __doc__, arguments, {"size": 16, "integrators": small})
 
 
 if __name__ == "__main__":

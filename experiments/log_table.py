@@ -23,11 +23,10 @@ import jaxvr
 from experiments.common import (
     errors,
     in_float64,
-    picture_options,
+    run_on_pictures,
     shells,
     spikes,
     table,
-    write_json,
 )
 from jaxvr import plot
 
@@ -93,13 +92,9 @@ def run(
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    options = picture_options(__doc__, arguments)
     jax.config.update("jax_enable_x64", True)
-    tiny: dict[str, Any] = {"size": 16, "nodes": 16, "slices": (8,), "shown": 8}
-    report = run(options.volume, options.out, **(tiny if options.tiny else {"size": options.size}))
-    if options.json:
-        write_json(options.json, report)
-    return report
+    tiny = {"size": 16, "nodes": 16, "slices": (8,), "shown": 8}
+    return run_on_pictures(run, __doc__, arguments, tiny)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import jaxvr
-from experiments.common import errors, picture_options, shells, table, write_json
+from experiments.common import errors, shells, table
 from jaxvr import plot
 
 TABLES = {
@@ -86,13 +86,8 @@ def run(
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    options = picture_options(__doc__, arguments)
-    form = {"size": (16, 16, 16), "scale": "log"}
-    tiny: dict[str, Any] = {"size": 16, "tables": {"log": form}}
-    report = run(options.volume, options.out, **(tiny if options.tiny else {"size": options.size}))
-    if options.json:
-        write_json(options.json, report)
-    return report
+    tiny = {"size": 16, "tables": {"log": {"size": (16, 16, 16), "scale": "log"}}}
+    return run_on_pictures(run, __doc__, arguments, tiny)
 
 
 if __name__ == "__main__":

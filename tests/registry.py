@@ -22,8 +22,9 @@ class Entry:
 
     error: largest difference of an integrator's image from `Analytic`'s in the setting of
     test_registry, whose transfer function has a jump. slope: difference of its derivative with
-    respect to colours and extinctions, relative. None for both: equal to rounding. variant: the
-    same class as another entry, or almost; crossed with all adjoints in `shade` only.
+    respect to colours and extinctions, relative. None for both: equal to rounding, in all
+    derivatives. variant: the same class as another entry, or almost; crossed with all adjoints in
+    `shade` only.
     """
 
     name: str

@@ -113,7 +113,7 @@ def compare(found, same_integrator, exact, entry):
     assert slopes == pytest.approx(same_integrator[1], rel=1e-9)
     if entry.error is None:
         assert np.allclose(image, exact[0], atol=1e-11)
-        assert slopes[1] == pytest.approx(exact[1][1], rel=1e-9)
+        assert slopes == pytest.approx(exact[1], rel=1e-9)
     else:
         assert np.allclose(image, exact[0], atol=entry.error)
         assert slopes[1] == pytest.approx(exact[1][1], rel=entry.slope)
