@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxvr import native as compiled
 from jaxvr._core.checks import as_floats, is_concrete, require_finite
 from jaxvr._core.status import check
 from jaxvr.adjoint import AbstractAdjoint, Pipeline, Replay
@@ -124,12 +125,17 @@ def render_rays(
 
 
 def trace(
-    volume: Any, camera: Camera | tuple[Any, Any], *, tracer: AbstractTracer | None = None
+    volume: Any,
+    camera: Camera | tuple[Any, Any],
+    *,
+    tracer: AbstractTracer | None = None,
+    native: bool | None = None,
 ) -> Segments:
     """The segments along the rays of a camera, to be shaded as often as you like.
 
     Args:
       camera: a camera, or rays (origins, directions) with shapes (..., 3).
+      native: whether to use compiled loops (see `jaxvr.native`); None for where they can be used.
 
     Returns:
       Segments, 8 bytes each in float32 (see `Segments`). They are constants: for gradients with
@@ -151,7 +157,8 @@ def trace(
         origins, directions = _rays_of(*camera, volume)
         shape, order = origins.shape[:-1], np.arange(origins.size // 3)
         origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
-    counts, status = _count(tracer, volume, origins, directions)
+    use = compiled.covers(native, volume.dtype, tracer)
+    counts, status = _count(tracer, use, volume, origins, directions)
     check(status)
     # Rays of like length together: then no ray of a batch waits for the others when shaded.
     by_length = np.argsort(np.asarray(counts), kind="stable")
@@ -163,7 +170,8 @@ def trace(
     # Buffers are rounded up to three leading bits, so that similar views share compiled functions.
     unit = 1 << max(int(start[-1]).bit_length() - 3, 10)
     total = -(-max(int(start[-1]), 1) // unit) * unit
-    nodes = _fill(tracer, volume, origins, directions, start[:-1].astype(np.int32), total)
+    runs = start[:-1].astype(np.int32)
+    nodes = _fill(tracer, use, volume, origins, directions, runs, total)
     return Segments(
         nodes.scalar,
         nodes.length,
@@ -229,20 +237,22 @@ def _shade(pipeline, adjoint, segments, transfer, background):
     return _over(rgba, background).reshape(*segments.shape, 4)
 
 
-@partial(jax.jit, static_argnums=0)
-def _count(tracer, volume, origins, directions):
+@partial(jax.jit, static_argnums=(0, 1))
+def _count(tracer, native, volume, origins, directions):
     scene = tracer.prepare(volume)
     rays, count = _batches((origins, directions))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(*rays)
-    return tuple(x.reshape(-1)[:count] for x in record(tracer, scene, rays))
+    found = compiled.kernels.count_nodes(scene, rays) if native else record(tracer, scene, rays)
+    return tuple(x.reshape(-1)[:count] for x in found)
 
 
-@partial(jax.jit, static_argnums=(0, 5))
-def _fill(tracer, volume, origins, directions, start, total):
+@partial(jax.jit, static_argnums=(0, 1, 6))
+def _fill(tracer, native, volume, origins, directions, start, total):
     scene = tracer.prepare(volume)
     (origins, directions, start), _ = _batches((origins, directions, start))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
-    return fill(tracer, scene, rays, start, total)
+    fill_all = compiled.kernels.fill_nodes if native else partial(fill, tracer)
+    return fill_all(scene, rays, start, total)
 
 
 def _run(pipeline, adjoint, volume, origins, directions, transfer):

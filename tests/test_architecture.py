@@ -11,7 +11,7 @@ import jaxvr
 
 ROOT = Path(jaxvr.__file__).parent
 ROOMS = [
-    "_core", "numerics", "volume", "view", "optics", "order", "trace", "composite", "adjoint",
+    "_core", "numerics", "volume", "view", "optics", "order", "trace", "composite", "native", "adjoint",
     "render", "fit", "shard", "plot",
     "pictures", "cli", "__main__",
 ]  # fmt: skip

@@ -7,6 +7,10 @@ piece's cotangents are known there and then; they are pulled back through the sl
 slab's two control points and to the segment, and through the segment to the cell's four vertices
 and the ray. Only such local operands are differentiated, and their cotangents are scattered.
 
+Where the transfer function is transparent, light is neither added nor lost: the forward pass takes
+such a stretch in one piece, whatever control points lie in it. The backward pass does so only if no
+gradient of the transfer function is asked for, since extinction has one at 0 too.
+
 Path replay is due to Vicini, Speierer and Jakob 2021; unlike theirs and DiffDVR's (Weiss and
 Westermann 2021) it divides by no transmittance: an opaque cell is no singularity.
 """
@@ -22,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxvr import native
 from jaxvr._core.pytree import pytree, static
 from jaxvr.adjoint.base import (
     AbstractAdjoint,
@@ -49,10 +54,16 @@ class Replay(AbstractAdjoint):
     Memory: the result, its operands, and one gradient; it does not grow with cells per ray. Time:
     the render plus a walk that also differentiates, about two to four renders for the transfer
     function. Gradients that are not asked for are not computed. First derivatives only.
+
+    native: whether to use compiled loops (see `jaxvr.native`); None for where they can be used.
     """
 
+    native: bool | None = None
+
     def run(self, pipeline, operands):
-        return _replay(pipeline, operands)
+        dtype = jax.tree.leaves(operands.table)[0].dtype
+        nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
+        return _replay(pipeline, native.covers(self.native, dtype, *nouns), operands)
 
 
 @pytree
@@ -62,7 +73,16 @@ class _Asked:
     leaves: tuple[bool, ...] = static()
 
 
-def _run(pipeline: Pipeline, operands: Operands):
+def _run(pipeline: Pipeline, compiled: bool, operands: Operands):
+    operands = operands._replace(table=pipeline.integrator.shorten(operands.table, True))
+
+    if compiled:
+        nouns = (pipeline.integrator, pipeline.compositor)
+        pixel, status = native.kernels.composite(*operands, *nouns)
+        shape = jax.tree.leaves(operands.rays)[0].shape
+        rgba = pipeline.compositor.finish(pixel).reshape(4, *shape)
+        return (jnp.moveaxis(rgba, 0, 1), status.reshape(shape)), pixel
+
     def one(rays):
         march = march_while(pipeline, operands._replace(rays=rays))
         return finish(pipeline, march), march.pixel
@@ -70,31 +90,67 @@ def _run(pipeline: Pipeline, operands: Operands):
     return lax.map(one, operands.rays)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _replay(pipeline: Pipeline, operands: Operands) -> tuple[Array, Array]:
-    return _run(pipeline, operands)[0]
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _replay(pipeline: Pipeline, compiled: bool, operands: Operands) -> tuple[Array, Array]:
+    return _run(pipeline, compiled, operands)[0]
 
 
-def _forward(pipeline: Pipeline, primals: Any):
+def _forward(pipeline: Pipeline, compiled: bool, primals: Any):
     leaves, structure = jax.tree.flatten(
         primals, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
     )
     operands = structure.unflatten([leaf.value for leaf in leaves])
     asked = _Asked(tuple(leaf.perturbed for leaf in leaves))
-    result, pixel = _run(pipeline, operands)
+    result, pixel = _run(pipeline, compiled, operands)
     return result, (operands, pixel, asked)
 
 
-def _backward(pipeline: Pipeline, residuals: Any, cotangents: Any):
+def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: Any):
     operands, finals, asked = residuals
     rgba_bar, _ = cotangents
     if isinstance(rgba_bar, jax.custom_derivatives.SymbolicZero):
         aval: Any = rgba_bar.aval
         rgba_bar = jnp.zeros(aval.shape, aval.dtype)
-    tracer, integrator, compositor = pipeline.tracer, pipeline.integrator, pipeline.compositor
+    tracer, integrator = pipeline.tracer, pipeline.integrator
     structure = jax.tree.structure(operands)
     perturbed: Operands = jax.tree.unflatten(structure, asked.leaves)
     optical = any(jax.tree.leaves(perturbed.table))
+    # Where it is transparent, segments have no gradient, but the transfer function has.
+    table = operands.table if optical else integrator.shorten(operands.table, False)
+    walked = operands._replace(table=table)
+    if compiled:
+        nouns = (integrator, pipeline.compositor)
+        scene_bar, rays_bar, table_bar = native.kernels.pull_back(
+            *(*walked, *nouns, finals, jnp.moveaxis(rgba_bar, 1, 0).reshape(4, -1)),
+            (perturbed.scene, perturbed.rays, optical),
+        )
+        rays_bar = _floats(tracer.rays_cotangent(operands.rays, rays_bar))
+    else:
+        scene_bar, rays_bar, table_bar = _walk_again(
+            pipeline, walked, finals, rgba_bar, perturbed, optical
+        )
+    scene_bar = _floats(tracer.scene_cotangent(operands.scene, scene_bar))
+    if optical:
+        table_bar = integrator.gradient_finish(operands.table, table_bar)
+    return (
+        Operands(
+            _as_cotangent(operands.scene, scene_bar),
+            _as_cotangent(operands.rays, rays_bar),
+            _as_cotangent(operands.table, _floats(table_bar)),
+        ),
+    )
+
+
+def _walk_again(
+    pipeline: Pipeline,
+    operands: Operands,
+    finals: Any,
+    rgba_bar: Array,
+    perturbed: Operands,
+    optical: bool,
+) -> tuple[Any, list[Array], Any]:
+    """Gradients of the scene and the table as they are accumulated, and cotangents of the rays."""
+    tracer, integrator, compositor = pipeline.tracer, pipeline.integrator, pipeline.compositor
     geometric = any(jax.tree.leaves((perturbed.scene, perturbed.rays)))
 
     def batch(carry, inputs):
@@ -114,8 +170,8 @@ def _backward(pipeline: Pipeline, residuals: Any, cotangents: Any):
             )
             if geometric:
                 trace_bar = tracer.pull_back(one.scene, rays, march.trace, segment_bar, trace_bar)
-            trace, cursor = advance(pipeline, one, march, cursor, finished)
-            return March(trace, cursor, pixel), table_bar, trace_bar
+            march = advance(pipeline, one, March(march.trace, cursor, pixel), finished)
+            return march, table_bar, trace_bar
 
         # A small table's gradient is summed batch by batch first: a sum of millions of terms in
         # float32 is then ten times as exact. A large one would cost more to clear than to add to.
@@ -133,16 +189,7 @@ def _backward(pipeline: Pipeline, residuals: Any, cotangents: Any):
     (scene_bar, table_bar), rays_bar = lax.scan(
         batch, (scene_bar, table_bar), (operands.rays, finals, rgba_bar)
     )
-    scene_bar = _floats(tracer.scene_cotangent(operands.scene, scene_bar))
-    if optical:
-        table_bar = integrator.gradient_finish(operands.table, table_bar)
-    return (
-        Operands(
-            _as_cotangent(operands.scene, scene_bar),
-            _as_cotangent(operands.rays, rays_bar),
-            _as_cotangent(operands.table, _floats(table_bar)),
-        ),
-    )
+    return scene_bar, rays_bar, table_bar
 
 
 def _floats(tree: Any) -> list[Array]:

@@ -1,0 +1,60 @@
+"""Compiled loops for the pipeline that most renders are: the same results, many times as fast.
+
+XLA runs a loop over rays kernel by kernel, on one thread, with every intermediate stored. Written
+in C, one pass over a block of rays is a handful of vector loops whose operands stay in the cache,
+and XLA's own threads share the blocks. `src/` follows the JAX code line by line: the same signs of
+predicates, the same pieces and sums; numbers agree to rounding. JAX's loops stay the reference, and
+serve wherever these do not: on accelerators, for other integrators, tracers and adjoints, and where
+no C compiler is found.
+
+A loop here is a function of the typed foreign function interface of XLA (`jax.ffi`), so that it
+works under a user's `jit` and `grad` (through `Replay`), and one after the other under `vmap`.
+`build` compiles and registers, `kernels` calls. To cover another noun: write it in `src/`, and say
+so in `covers`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxvr.composite.over import Over
+from jaxvr.native import build, kernels
+from jaxvr.optics.analytic import Analytic
+from jaxvr.trace.raycast import RayCast
+from jaxvr.trace.recorded import Recorded
+
+
+def missing(dtype: Any = "float32") -> str | None:
+    """None where compiled loops are available on this machine, else why not. Compiles them."""
+    if jax.default_backend() != "cpu":
+        return f"JAX computes on {jax.default_backend()}, and these loops are for CPUs."
+    name = np.dtype(dtype).name
+    if name not in ("float32", "float64"):
+        return f"There are none for {name}."
+    return build.load(name)
+
+
+def covers(wanted: bool | None, dtype: Any, *nouns: Any) -> bool:
+    """Whether compiled loops are to be used for these tracers, integrators and compositors.
+
+    wanted: None where they can be, False never, True always.
+
+    Raises:
+      ValueError: if they are wanted and cannot be used, with the reason.
+    """
+    if wanted is False:
+        return False
+    others = [n for n in nouns if type(n) not in (RayCast, Recorded, Analytic, Over)]
+    if others:
+        reason = f"There are none for {type(others[0]).__name__}."
+    else:
+        reason = missing(dtype)
+    if wanted and reason:
+        raise ValueError(f"Compiled loops cannot be used here (native=True): {reason}")
+    return reason is None
+
+
+__all__ = ["covers", "kernels", "missing"]

@@ -1,0 +1,179 @@
+"""Calls of the compiled loops: what a pipeline's arrays look like to them, and what comes back.
+
+Rays are flat here, (N,); the loops make blocks of their own, which XLA's threads take in turns.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxvr.composite.over import Over, OverState
+from jaxvr.native.build import target_name
+from jaxvr.numerics.rules import Rule, rule_for
+from jaxvr.optics.analytic import RULES, Analytic
+from jaxvr.optics.partition import JUMP_WIDTH, Nodes
+from jaxvr.trace.raycast import CastScene
+from jaxvr.trace.recorded import Nodes as Recording
+from jaxvr.trace.recorded import Runs
+from jaxvr.trace.shear import ShearedRays
+
+Array = jax.Array
+Shape = jax.ShapeDtypeStruct
+LOCATIONS = {"point": 0, "cell": 1, "corner": 2}
+PAIR = 10  # numbers of a row of `AbstractSlabIntegrator.gradient_start`
+
+
+def composite(
+    scene: Any, rays: Any, table: Nodes, integrator: Analytic, over: Over
+) -> tuple[OverState, Array]:
+    """Final sums and status (N,) of rays (N,), cast through a `CastScene` or played back."""
+    dtype = table.position.dtype
+    world, count = _world(scene, rays)
+    shapes = [Shape((8, count), dtype), Shape((count,), jnp.int32)]
+    optics = _optics(table, integrator, over)
+    if isinstance(scene, Recording):
+        (sums,) = _call("shade", dtype, shapes[:1])(*world, *optics)
+        status = jnp.zeros(count, jnp.int32)
+    else:
+        sums, status = _call("render", dtype, shapes)(*world, *optics)
+    return OverState((sums[0], sums[4]), (sums[1:4], sums[5:8])), status
+
+
+def pull_back(
+    scene: Any,
+    rays: Any,
+    table: Nodes,
+    integrator: Analytic,
+    over: Over,
+    final: OverState,
+    rgba_bar: Array,
+    asked: tuple[Any, Any, bool],
+) -> tuple[Any, Any, Any]:
+    """Gradients of the scene, the rays and the table, as `gradient_start` of tracer and integrator
+    has them.
+
+    Args:
+      final: from `composite`. rgba_bar (4, N): cotangent of the pixels.
+      asked: structures of (scene, rays) with True at leaves that are asked for, and whether the
+        table is.
+    """
+    dtype = table.position.dtype
+    world, count = _world(scene, rays)
+    sums = jnp.stack([final.depth[0], *final.rgb[0], final.depth[1], *final.rgb[1]])
+    operands = (*world, *_optics(table, integrator, over), sums, rgba_bar)
+    ask_scene, ask_rays, ask_table = asked
+    rows = Shape((2 * table.position.shape[0] if ask_table else 0, PAIR), dtype)
+
+    def sized(like: Array, wanted: bool) -> Shape:
+        return Shape(like.shape if wanted else (0,), dtype)
+
+    if isinstance(scene, Recording):
+        shapes = [rows, *(sized(x, a) for x, a in zip(scene, ask_scene, strict=True))]
+        table_bar, *found = _call("shade_pull", dtype, shapes)(*operands)
+        scene_bar = Recording(*(x if a else None for x, a in zip(found, ask_scene, strict=True)))
+        return scene_bar, None, table_bar if ask_table else None
+    mesh, at_points = scene.mesh, scene.mesh.location == "point"
+    by_values, by_points = ask_scene.mesh.values, ask_scene.mesh.coordinates
+    by_rays = any(jax.tree.leaves(ask_rays))
+    points = mesh.coordinates.shape[0] // 3
+    shapes = [
+        rows,
+        Shape((points if by_values or by_points else 0, 4), dtype),
+        sized(mesh.values, (by_values or by_points) and not at_points),
+        Shape((6, count if by_rays else 0), dtype),
+    ]
+    table_bar, vertices, values, by_ray = _call("render_pull", dtype, shapes)(*operands)
+    values = vertices[:, 3] if at_points else values
+    scene_bar = (
+        values if by_values else None,
+        vertices[:, :3].T.reshape(-1) if by_points else None,
+    )
+    rays_bar = tuple(x.reshape(rays.origin_x.shape) for x in by_ray) if by_rays else None
+    return scene_bar, rays_bar, table_bar if ask_table else None
+
+
+def count_nodes(scene: CastScene, rays: ShearedRays) -> tuple[Array, Array]:
+    """Number of nodes and status (N,) of each ray: `trace.recorded.record`."""
+    world, count = _world(scene, rays)
+    shapes = [Shape((count,), jnp.int32)] * 2
+    return tuple(_call("count", scene.mesh.coordinates.dtype, shapes)(*world))
+
+
+def fill_nodes(scene: CastScene, rays: ShearedRays, start: Array, total: int) -> Recording:
+    """The nodes (total,) of all rays, from `start` (N,) on: `trace.recorded.fill`."""
+    dtype = scene.mesh.coordinates.dtype
+    shapes = [Shape((total,), dtype)] * 2
+    return Recording(*_call("fill", dtype, shapes)(*_world(scene, rays)[0], start.reshape(-1)))
+
+
+def _call(name: str, dtype: Any, shapes: Any):
+    target = target_name(name, np.dtype(dtype).name)
+    return jax.ffi.ffi_call(target, shapes, vmap_method="sequential")
+
+
+def _world(scene: Any, rays: Any) -> tuple[tuple[Any, ...], int]:
+    """The arguments that say what is traced, and the number of rays."""
+    if isinstance(rays, Runs):
+        return (*scene, rays.first.reshape(-1), rays.end.reshape(-1)), rays.first.size
+    mesh = scene.mesh
+    points = mesh.coordinates.reshape(3, -1)
+    at_points = mesh.location == "point"
+    values = mesh.values if at_points else jnp.zeros_like(points[0])
+    axes = (rays.axis_x, rays.axis_y, rays.axis_z)
+    numbers = (
+        *(rays.origin_x, rays.origin_y, rays.origin_z, rays.shear_x, rays.shear_y),
+        *(rays.shear_x_low, rays.shear_y_low, rays.sign, rays.stretch),
+    )
+    arrays = (
+        jnp.concatenate([points, values[None]]).T,
+        jnp.zeros(1, points.dtype) if at_points else mesh.values,
+        *(mesh.cells, mesh.neighbors),
+        *(scene.boxes.low, scene.boxes.high, mesh.faces),
+        *(jnp.stack([x.reshape(-1) for x in rows]) for rows in (axes, numbers)),
+        np.array([LOCATIONS[mesh.location], mesh.seams], np.int32),
+    )
+    return arrays, rays.origin_x.size
+
+
+def _optics(table: Nodes, integrator: Analytic, over: Over) -> tuple[Any, ...]:
+    dtype = table.position.dtype
+    small = RULES[integrator.accuracy]
+    rule = small or rule_for(dtype)
+    enough = math.inf if over.termination == 0 else -math.log(over.termination)
+    numbers = np.array([rule.depth, small is not None, enough], dtype)
+    return table.position, slabs_of(table), _rows(rule).astype(dtype), numbers
+
+
+def _rows(rule: Rule) -> np.ndarray:
+    """by_front, by_back, and weights times the Bernstein basis of degree 2 (5, n)."""
+    u, weights = np.array(rule.nodes), np.array(rule.weights)
+    basis = [(1 - u) ** 2, 2 * u * (1 - u), u * u]
+    return np.stack([u * (1 - u / 2), u * u / 2, *(weights * b for b in basis)])
+
+
+def slabs_of(table: Nodes) -> Array:
+    """A record for each of K + 1 slabs (K + 1, 16): `Slab` of src/slab.h."""
+    position = lax.stop_gradient(table.position)
+    count, dtype = position.shape[0], position.dtype
+    infinite = jnp.full(1, jnp.inf, dtype)
+    slab = np.arange(count + 1)
+    left, right = np.maximum(slab - 1, 0), np.minimum(slab, count - 1)
+    low, high = position[left], position[right]
+    outermost = (slab == 0) | (slab == count)
+    jump = (high - low < JUMP_WIDTH) & ~outermost
+    width = jnp.where(jump | outermost, JUMP_WIDTH, high - low)
+    first, second = table.optical[:, left], table.optical[:, right]
+    floor, ceiling = jnp.concatenate([-infinite, position]), jnp.concatenate([position, infinite])
+    dark = (first[0] == 0) & (second[0] == 0)
+    dark_range = (jnp.where(dark, floor, jnp.inf), jnp.where(dark, ceiling, -jnp.inf))
+    columns = [
+        *(floor, ceiling, low, jnp.where(outermost, 0, 1 / width), *first, *(second - first)),
+        *(width, jump.astype(dtype), *dark_range),
+    ]
+    return jnp.stack(columns, 1)

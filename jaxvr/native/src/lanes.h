@@ -1,0 +1,40 @@
+/* A block of rays side by side: each quantity is a row with one number a ray (a lane), so that a
+ * loop over lanes becomes vector instructions. Lanes 0 to n - 1 are in use; when a ray is through,
+ * the last one takes its place, so that no vector carries finished rays. */
+#ifndef JAXVR_LANES_H
+#define JAXVR_LANES_H
+
+#include "real.h"
+
+#define LANES 128  /* rays in a block; its rows stay in the cache */
+#define ENTRIES 8  /* entries of a ray found at a time */
+
+enum { VX, VY, VZ, VLOW, VVALUE, VERTEX }; /* rows of a vertex, see trace/shear.py */
+
+/* Rows of numbers. FACE: three vertices of the entry face; WEIGHT: their barycentric weights;
+ * APEX: the fourth vertex; LEAVE: weights of the exit face's vertices, OF_B and OF_C: barycentric
+ * coordinates of the last two. SUMS: compensated optical
+ * depth and r, g, b, totals first. FINAL, PIXEL: the same sums at the ray's end and the pixel's
+ * cotangent, for derivatives; SBAR: cotangents of the segment's front, back and length. */
+enum {
+  ORIGIN, SHEAR_X = ORIGIN + 3, SHEAR_Y = SHEAR_X + 3, SIGN = SHEAR_Y + 3, STRETCH,
+  FACE, WEIGHT = FACE + 3 * VERTEX, APEX = WEIGHT + 3, LEAVE = APEX + VERTEX,
+  OF_B = LEAVE + 3, OF_C, DEPTH, FRONT = DEPTH + 2, BACK, LENGTH, CURSOR, SUMS, ROWS = SUMS + 8,
+  FINAL = ROWS, PIXEL = FINAL + 8, SBAR = PIXEL + 4, RBAR = SBAR + 3, ALL_ROWS = RBAR + 6
+};
+enum { A = FACE, B = FACE + VERTEX, C = FACE + 2 * VERTEX };
+/* Rows of integers. FRESH: the segment does not start where the one before has ended, in scalar. */
+enum { RAY, AXES, WORD = AXES + 3, POSITIVE, DROP, SLAB, FRESH, NEXT, LOST, SLOT, INTEGERS };
+
+typedef struct {
+  _Alignas(64) real row[ALL_ROWS][LANES];
+  _Alignas(64) int32_t integer[INTEGERS][LANES];
+} Lanes;
+
+static inline void move_lane(Lanes *lanes, int rows, int from, int to) {
+  if (from == to) return;
+  for (int k = 0; k < rows; k++) lanes->row[k][to] = lanes->row[k][from];
+  for (int k = 0; k < INTEGERS; k++) lanes->integer[k][to] = lanes->integer[k][from];
+}
+
+#endif

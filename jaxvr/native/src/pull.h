@@ -1,0 +1,222 @@
+/* Derivatives, front to back as in adjoint/replay.py: of pieces by their slab's control points and
+ * by their segment (optics/integrator.py), and of segments by their cell and ray (trace/local.py). */
+#ifndef JAXVR_PULL_H
+#define JAXVR_PULL_H
+
+#include "scene.h"
+#include "shade.h"
+
+#define NODE_PAIR 10 /* position, extinction, r, g, b of a slab's lower and upper control point */
+
+/* Composites m pieces and takes the pixel's cotangent back to `pair` (NODE_PAIR, m), the ends of
+ * the slabs, and to SBAR, the segments. */
+INLINE void pull_pieces(const Transfer *tf, Lanes *lanes, const Pieces *p, int m,
+                        real pair[NODE_PAIR][LANES], const int dense) {
+  const Slab *restrict slabs = tf->slabs;
+  LANES_LOOP
+  for (int j = 0; j < m; j++) {
+    int i = dense ? j : p->lane[j];
+    const Slab *slab = slabs + p->slab[j];
+    real through = exp_minus(lanes->row[SUMS][i], lanes->row[SUMS + 4][i]);
+    real length = p->length[j], w = p->w[j], w_back = p->w_back[j];
+    real tau_front = p->front[0][j], tau_back = tau_front + p->change[0][j];
+    real a = tau_front * length, b = tau_back * length;
+    real sum = lanes->row[SUMS][i], excess = lanes->row[SUMS + 4][i];
+    add_to(&sum, &excess, (real)0.5 * (a + b));
+    lanes->row[SUMS][i] = sum;
+    lanes->row[SUMS + 4][i] = excess;
+    /* PIXEL + 3 holds the cotangent of alpha times the final transmittance. */
+    real depth_bar = lanes->row[PIXEL + 3][i], w_bar = 0, w_back_bar = 0;
+    real front_bar[4], back_bar[4];
+    for (int c = 1; c < 4; c++) {
+      real light = p->front[c][j] * w + p->change[c][j] * w_back;
+      sum = lanes->row[SUMS + c][i], excess = lanes->row[SUMS + 4 + c][i];
+      add_to(&sum, &excess, through * light);
+      lanes->row[SUMS + c][i] = sum;
+      lanes->row[SUMS + 4 + c][i] = excess;
+      real behind = (lanes->row[FINAL + c][i] - sum) - (lanes->row[FINAL + 4 + c][i] - excess);
+      real pixel = lanes->row[PIXEL + c - 1][i], light_bar = through * pixel;
+      depth_bar -= pixel * behind;
+      w_bar += light_bar * p->front[c][j];
+      w_back_bar += light_bar * p->change[c][j];
+      front_bar[c] = light_bar * (w - w_back);
+      back_bar[c] = light_bar * w_back;
+    }
+    real half = (real)0.5 * transmittance(a, b), shared = half * w_bar + (real)0.5 * depth_bar;
+    real by_b = half - (real)0.5 * p->b2[j], by_a = by_b - (real)0.5 * p->b1[j];
+    real a_bar = shared + by_a * w_back_bar, b_bar = shared + by_b * w_back_bar;
+    front_bar[0] = a_bar * length;
+    back_bar[0] = b_bar * length;
+    real place0 = p->place[0][j], place1 = p->place[1][j], t0 = p->t[0][j], t1 = p->t[1][j];
+    real move0 = 0, move1 = 0;
+    for (int c = 0; c < 4; c++) {
+      real change = slab->change[c];
+      move0 += front_bar[c] * change;
+      move1 += back_bar[c] * change;
+      pair[1 + c][j] = front_bar[c] * (1 - place0) + back_bar[c] * (1 - place1);
+      pair[6 + c][j] = front_bar[c] * place0 + back_bar[c] * place1;
+    }
+    move0 /= p->width[j], move1 /= p->width[j];
+    pair[0][j] = -(move0 * (1 - place0) + move1 * (1 - place1));
+    pair[5][j] = -(move0 * place0 + move1 * place1);
+    lanes->row[SBAR][i] += move0 * (1 - t0) + move1 * (1 - t1);
+    lanes->row[SBAR + 1][i] += move0 * t0 + move1 * t1;
+    lanes->row[SBAR + 2][i] += (a_bar * tau_front + b_bar * tau_back) * p->fraction[j];
+  }
+}
+
+/* All pieces of the lanes' segments; `table` (2 K, NODE_PAIR), or NULL if not asked for: row
+ * left + right of a slab's control points. */
+static void pull_shading(const Transfer *tf, const Rule *rule, Lanes *lanes, int n,
+                         double *table) {
+  Pieces p;
+  _Alignas(64) real pair[NODE_PAIR][LANES];
+  for (int k = 0; k < 3; k++) memset(lanes->row[SBAR + k], 0, n * sizeof(real));
+  int m = begin_segments(tf, lanes, n, 1, p.lane);
+  while (m > 0) {
+    cut(tf, lanes, &p, m, m == n, 1);
+    integrate(rule, &p, m, 1);
+    if (m == n) pull_pieces(tf, lanes, &p, m, pair, 1);
+    else pull_pieces(tf, lanes, &p, m, pair, 0);
+    if (table)
+      for (int j = 0; j < m; j++) {
+        int k = p.slab[j], left = k > 0 ? k - 1 : 0, right = k < tf->count ? k : tf->count - 1;
+        double *row = table + NODE_PAIR * (left + right);
+        for (int c = 0; c < NODE_PAIR; c++) row[c] += pair[c][j];
+      }
+    m = go_on(&p, m);
+  }
+}
+
+/* Gradient over the projected face of what is linear on it, from differences to its first vertex. */
+INLINE void slopes(real to_b, real to_c, real ux, real uy, real vx, real vy, real per_area, real *x,
+                   real *y) {
+  *x = (to_b * vy - to_c * uy) * per_area;
+  *y = (ux * to_c - vx * to_b) * per_area;
+}
+
+typedef struct { real x, y, z, s; } Pulled;
+
+/* Cotangents of a crossing, for the whole face; area is twice its signed area. */
+INLINE Pulled pull_crossing(const real a[VERTEX], const real b[VERTEX], const real c[VERTEX],
+                            real area, real z_bar, real s_bar) {
+  real ux = b[VX] - a[VX], uy = b[VY] - a[VY], vx = c[VX] - a[VX], vy = c[VY] - a[VY];
+  real per_area = area == 0 ? 0 : 1 / (area == 0 ? 1 : area), zx, zy, sx, sy;
+  slopes((b[VZ] - a[VZ]) + (b[VLOW] - a[VLOW]), (c[VZ] - a[VZ]) + (c[VLOW] - a[VLOW]), ux, uy, vx,
+         vy, per_area, &zx, &zy);
+  slopes(b[VVALUE] - a[VVALUE], c[VVALUE] - a[VVALUE], ux, uy, vx, vy, per_area, &sx, &sy);
+  Pulled q = {-(z_bar * zx + s_bar * sx), -(z_bar * zy + s_bar * sy), z_bar, s_bar};
+  return q;
+}
+
+/* Cotangents of the four vertices of the lanes' cells, a, b, c and the apex: x, y, z in the ray's
+ * axes, and the scalar. */
+typedef struct {
+  _Alignas(64) real of[4][4][LANES], share[2][LANES];
+} CellBar;
+
+/* Shares of b and c in the entry crossings. */
+static void entry_shares(Lanes *lanes, int n, real share[2][LANES]) {
+  real(*row)[LANES] = lanes->row;
+  word_t flat = 0;
+  LANES_LOOP
+  for (int i = 0; i < n; i++) {
+    real sum = (row[WEIGHT][i] + row[WEIGHT + 1][i]) + row[WEIGHT + 2][i];
+    real inverse = 1 / (sum == 0 ? 1 : sum);
+    share[0][i] = row[WEIGHT + 1][i] * inverse;
+    share[1][i] = row[WEIGHT + 2][i] * inverse;
+    flat |= MASK(sum == 0);
+  }
+  for (int i = 0; flat && i < n; i++) {
+    real x[3] = {row[A + VX][i], row[B + VX][i], row[C + VX][i]};
+    real y[3] = {row[A + VY][i], row[B + VY][i], row[C + VY][i]};
+    real w[3] = {row[WEIGHT][i], row[WEIGHT + 1][i], row[WEIGHT + 2][i]};
+    if (w[0] + w[1] + w[2] == 0) shares(x, y, w, &share[0][i], &share[1][i]);
+  }
+}
+
+static void pull_cells(Lanes *lanes, int n, CellBar *bar) {
+  real(*row)[LANES] = lanes->row;
+  entry_shares(lanes, n, bar->share);
+  LANES_LOOP
+  for (int i = 0; i < n; i++) {
+    int drop = lanes->integer[DROP][i];
+    word_t drop_a = MASK(drop == 0), drop_c = MASK(drop == 2), keep_b = ~MASK(drop == 1);
+    word_t turned = MASK((lanes->integer[WORD][i] & 4) != 0);
+    real a[VERTEX], b[VERTEX], c[VERTEX], p[VERTEX], q[VERTEX], d[VERTEX];
+    for (int k = 0; k < VERTEX; k++) {
+      a[k] = row[A + k][i], b[k] = row[B + k][i], c[k] = row[C + k][i], d[k] = row[APEX + k][i];
+      p[k] = PICK(drop_a, b[k], a[k]), q[k] = PICK(drop_c, b[k], c[k]);
+    }
+    real in_b = bar->share[0][i], in_c = bar->share[1][i], in_a = (1 - in_b) - in_c;
+    real out_q = row[OF_B][i], out_d = row[OF_C][i], out_p = (1 - out_q) - out_d;
+    real zi, zi_low, si, zo, zo_low, so;
+    crossing(a[VZ], a[VLOW], a[VVALUE], b[VZ], b[VLOW], b[VVALUE], c[VZ], c[VLOW], c[VVALUE], in_b,
+             in_c, &zi, &zi_low, &si);
+    crossing(p[VZ], p[VLOW], p[VVALUE], q[VZ], q[VLOW], q[VVALUE], d[VZ], d[VLOW], d[VVALUE], out_q,
+             out_d, &zo, &zo_low, &so);
+    /* The segment: from its cotangents to those of the two crossings, see make_segment. */
+    real front_bar = row[SBAR][i], back_bar = row[SBAR + 1][i], length_bar = row[SBAR + 2][i];
+    real advance = (zo - zi) + (zo_low - zi_low), chord = PICK(turned, -advance, advance);
+    word_t proper = MASK(chord > 0);
+    real z0 = zi + zi_low, z1 = PICK(proper, zo + zo_low, z0);
+    word_t behind0 = MASK(z0 < 0), behind1 = MASK(z1 < 0), cuts = behind0 ^ behind1;
+    real whole = PICK(cuts, z1 - z0, 1), t = -z0 / whole, difference = so - si;
+    real kept = PICK(behind0 | ~proper, 0, chord), length = PICK(cuts, most(z0, z1), kept);
+    real scaled = length_bar * row[STRETCH][i];
+    real along = PICK(behind0 | ~proper, 0, PICK(turned, -scaled, scaled));
+    real cut_bar = PICK(behind0, front_bar, back_bar); /* of the scalar at the eye */
+    real t_bar = cut_bar * difference / (whole * whole);
+    word_t later = MASK(z1 > z0);
+    real zi_bar = PICK(cuts, PICK(later, 0, scaled) - t_bar * z1, -along);
+    real zo_bar = PICK(cuts, PICK(later, scaled, 0) + t_bar * z0, along);
+    real si_cut = PICK(behind0, front_bar * (1 - t), front_bar + back_bar * (1 - t));
+    real so_cut = PICK(behind0, back_bar + front_bar * t, back_bar * t);
+    real si_bar = PICK(cuts, si_cut, front_bar), so_bar = PICK(cuts, so_cut, back_bar);
+    /* The crossings: to the faces' vertices. */
+    word_t positive = MASK(lanes->integer[POSITIVE][i] != 0);
+    real area = (row[WEIGHT][i] + row[WEIGHT + 1][i]) + row[WEIGHT + 2][i];
+    real exit_area = (row[LEAVE][i] + row[LEAVE + 1][i]) + row[LEAVE + 2][i];
+    area = PICK(positive, area, -area);
+    exit_area = PICK(positive ^ ~keep_b, exit_area, -exit_area);
+    Pulled in = pull_crossing(a, b, c, area, zi_bar, si_bar);
+    Pulled out = pull_crossing(p, q, d, exit_area, zo_bar, so_bar);
+    real sx = row[SHEAR_X][i] + row[SHEAR_X + 1][i], sy = row[SHEAR_Y][i] + row[SHEAR_Y + 1][i];
+    real sign = row[SIGN][i];
+    real in_z = sign * in.z - sx * in.x - sy * in.y, out_z = sign * out.z - sx * out.x - sy * out.y;
+    real from_in[4] = {in_a, in_b, in_c, 0};
+    real from_out[4] = {PICK(drop_a, 0, out_p), PICK(drop_a, out_p, PICK(drop_c, out_q, 0)),
+                        PICK(drop_c, 0, out_q), out_d};
+    for (int v = 0; v < 4; v++) {
+      bar->of[v][0][i] = from_in[v] * in.x + from_out[v] * out.x;
+      bar->of[v][1][i] = from_in[v] * in.y + from_out[v] * out.y;
+      bar->of[v][2][i] = from_in[v] * in_z + from_out[v] * out_z;
+      bar->of[v][3][i] = from_in[v] * in.s + from_out[v] * out.s;
+    }
+    row[RBAR][i] -= in.x + out.x;
+    row[RBAR + 1][i] -= in.y + out.y;
+    row[RBAR + 2][i] -= in_z + out_z;
+    row[RBAR + 3][i] -= sign * (in.x * zi + out.x * zo);
+    row[RBAR + 4][i] -= sign * (in.y * zi + out.y * zo);
+    row[RBAR + 5][i] += length_bar * length;
+  }
+}
+
+/* To where they came from. vertices (P, 4): coordinates, and scalars at points; values: others. */
+static void scatter_cells(const Mesh *mesh, const Lanes *lanes, int n, const CellBar *bar,
+                          real *vertices, real *values) {
+  for (int i = 0; i < n; i++) {
+    if (lanes->integer[LOST][i]) continue;
+    int word = lanes->integer[WORD][i], cell = word >> 4, corner = word & 3;
+    for (int v = 0; v < 4; v++) {
+      int at = v < 3 ? entry_corner(corner, v) : corner;
+      real *point = vertices + 4 * (int64_t)mesh->cells[4 * (int64_t)cell + at];
+      for (int k = 0; k < 3; k++) point[lanes->integer[AXES + k][i]] += bar->of[v][k][i];
+      real of_value = bar->of[v][3][i];
+      if (mesh->location == AT_POINTS) point[3] += of_value;
+      else values[mesh->location == AT_CELLS ? cell : 4 * (int64_t)cell + at] += of_value;
+    }
+  }
+}
+
+#endif

@@ -1,0 +1,265 @@
+/* From cell to cell: see trace/raycast.py. A block is filled with rays that enter the mesh;
+ * `arrive` finds the segment of each lane's new cell, `leave` names the cell behind it, and
+ * `settle` lets rays that left the mesh enter again or go. */
+#ifndef JAXVR_WALK_H
+#define JAXVR_WALK_H
+
+#include "entry.h"
+
+#define STATUS_LOST 1
+
+
+/* axes (3, N); numbers (11, N): origin, S_x, S_y, their lost parts, sign, stretch (see Lanes). */
+typedef struct {
+  int64_t count;
+  const int32_t *axes;
+  const real *numbers;
+} Rays;
+
+typedef struct {
+  Mesh mesh;
+  Tree tree;
+  Rays rays;
+} World;
+
+typedef struct {
+  int n;
+  Ray rays[LANES];
+  Entries entries[LANES];
+  Lanes lanes;
+} Block;
+
+static inline void load_ray(const Rays *rays, int64_t r, Ray *ray) {
+  int64_t n = rays->count;
+  const real *x = rays->numbers + r;
+  for (int k = 0; k < 3; k++) {
+    ray->axis[k] = rays->axes[k * n + r];
+    ray->origin[k] = x[k * n];
+  }
+  ray->x_high = head(x[3 * n]), ray->x_rest = x[3 * n] - ray->x_high, ray->x_low = head(x[5 * n]);
+  ray->y_high = head(x[4 * n]), ray->y_rest = x[4 * n] - ray->y_high, ray->y_low = head(x[6 * n]);
+  ray->sign = x[7 * n];
+}
+
+/* A lane's ray goes through its next entry, if it has one. */
+static int enter(const World *world, Block *block, int lane) {
+  Lanes *lanes = &block->lanes;
+  int slot = lanes->integer[SLOT][lane];
+  Entries *list = block->entries + slot;
+  const Ray *ray = block->rays + slot;
+  if (list->next == list->count) {
+    if (!list->more) return 0;
+    real depth = list->depth[list->count - 1];
+    int32_t face = list->face[list->count - 1];
+    search(&world->mesh, &world->tree, 1, ray, list, &depth, &face);
+    if (!list->count) return 0;
+  }
+  int32_t word = list->face[list->next++];
+  FaceSeen face;
+  see_face(&world->mesh, ray, word >> 4, word & 3, &face);
+  for (int v = 0; v < 3; v++) {
+    for (int k = 0; k < VERTEX; k++) lanes->row[FACE + v * VERTEX + k][lane] = face.vertex[v][k];
+    lanes->row[WEIGHT + v][lane] = face.weight[v];
+  }
+  lanes->row[DEPTH][lane] = face.z;
+  lanes->row[DEPTH + 1][lane] = face.z_low;
+  lanes->row[BACK][lane] = face.value;
+  lanes->integer[NEXT][lane] = word & ~8;
+  lanes->integer[POSITIVE][lane] = face.positive;
+  lanes->integer[FRESH][lane] = 1;
+  return 1;
+}
+
+/* Lanes for the rays first to first + count - 1 that meet the mesh; rows from SUMS on are zero. */
+static void fill_block(const World *world, Block *block, int64_t first, int count, int rows) {
+  real before[PACKET];
+  int32_t none[PACKET];
+  for (int i = 0; i < PACKET; i++) before[i] = -INFINITY, none[i] = -1;
+  for (int i = 0; i < count; i++) load_ray(&world->rays, first + i, block->rays + i);
+  for (int i = 0; i < count; i += PACKET) {
+    int m = count - i < PACKET ? count - i : PACKET;
+    search(&world->mesh, &world->tree, m, block->rays + i, block->entries + i, before, none);
+  }
+  Lanes *lanes = &block->lanes;
+  int n = 0;
+  for (int i = 0; i < count; i++) {
+    lanes->integer[SLOT][n] = i;
+    if (!enter(world, block, n)) continue;
+    const Ray *ray = block->rays + i;
+    real numbers[] = {ray->origin[0], ray->origin[1], ray->origin[2], ray->x_high, ray->x_rest,
+                      ray->x_low, ray->y_high, ray->y_rest, ray->y_low, ray->sign,
+                      world->rays.numbers[8 * world->rays.count + first + i]};
+    for (int k = 0; k < 11; k++) lanes->row[ORIGIN + k][n] = numbers[k];
+    for (int k = SUMS; k < rows; k++) lanes->row[k][n] = 0;
+    for (int k = 0; k < 3; k++) lanes->integer[AXES + k][n] = ray->axis[k];
+    lanes->integer[RAY][n] = (int32_t)(first + i);
+    lanes->integer[SLAB][n] = 0;
+    lanes->integer[LOST][n] = 0;
+    n++;
+  }
+  block->n = n;
+}
+
+/* The entry face with its own cell's scalars, where those behind the face may differ. */
+static void reload_values(const Mesh *mesh, Lanes *lanes, int n) {
+  for (int i = 0; i < n; i++) {
+    int word = lanes->integer[NEXT][i];
+    if (mesh->location == AT_POINTS && !(word & 8)) continue;
+    int cell = word >> 4, corner = word & 3;
+    real x[3], y[3], w[3], s[3], of_b, of_c;
+    for (int v = 0; v < 3; v++) {
+      int k = entry_corner(corner, v);
+      s[v] = value_at(mesh, cell, k, mesh->cells[4 * (int64_t)cell + k]);
+      lanes->row[FACE + v * VERTEX + VVALUE][i] = s[v];
+      x[v] = lanes->row[FACE + v * VERTEX + VX][i], y[v] = lanes->row[FACE + v * VERTEX + VY][i];
+      w[v] = lanes->row[WEIGHT + v][i];
+    }
+    shares(x, y, w, &of_b, &of_c);
+    lanes->row[BACK][i] = s[0] + (of_b * (s[1] - s[0]) + of_c * (s[2] - s[0]));
+    lanes->integer[FRESH][i] = 1;
+  }
+}
+
+/* What lies behind the eye is cut off: returns the length in units of depth. */
+INLINE real clip_at_eye(real z0, real z1, real chord, real *front, real *back) {
+  int behind0 = z0 < 0, behind1 = z1 < 0, cuts = behind0 != behind1;
+  real whole = cuts ? z1 - z0 : 1;
+  real at_eye = *front + (*back - *front) * (-z0 / whole);
+  *front = cuts & behind0 ? at_eye : *front;
+  *back = cuts & behind1 ? at_eye : *back;
+  real kept = behind0 ? 0 : chord;
+  return cuts ? most(z0, z1) : kept;
+}
+
+/* Barycentric coordinates of exits by rays that lie in the exit face's plane. */
+static void exits_on_edge(Lanes *lanes, int n) {
+  for (int i = 0; i < n; i++) {
+    real w[3] = {lanes->row[LEAVE][i], lanes->row[LEAVE + 1][i], lanes->row[LEAVE + 2][i]};
+    if (w[0] + w[1] + w[2] != 0) continue;
+    int drop = lanes->integer[DROP][i], rows[3] = {drop == 0 ? B : A, drop == 2 ? B : C, APEX};
+    real x[3], y[3];
+    for (int v = 0; v < 3; v++)
+      x[v] = lanes->row[rows[v] + VX][i], y[v] = lanes->row[rows[v] + VY][i];
+    shares(x, y, w, &lanes->row[OF_B][i], &lanes->row[OF_C][i]);
+  }
+}
+
+/* The fourth vertex of each lane's new cell, the exit, and the segment. */
+static void arrive(const Mesh *mesh, Lanes *lanes, int n) {
+  real(*row)[LANES] = lanes->row;
+  int32_t(*integer)[LANES] = lanes->integer;
+  const real *restrict vertices = mesh->vertices;
+  const int32_t *restrict cells = mesh->cells;
+  if (mesh->location != AT_POINTS || mesh->seams) reload_values(mesh, lanes, n);
+  LANES_LOOP
+  for (int i = 0; i < n; i++) {
+    int word = integer[NEXT][i];
+    int point = cells[4 * (word >> 4) + (word & 3)];
+    real px = vertices[4 * point + integer[AXES][i]];
+    real py = vertices[4 * point + integer[AXES + 1][i]];
+    real pz = vertices[4 * point + integer[AXES + 2][i]];
+    integer[WORD][i] = word;
+    row[APEX + VVALUE][i] = vertices[4 * point + 3];
+    shear(px, py, pz, row[ORIGIN][i], row[ORIGIN + 1][i], row[ORIGIN + 2][i], row[SHEAR_X][i],
+          row[SHEAR_X + 1][i], row[SHEAR_X + 2][i], row[SHEAR_Y][i], row[SHEAR_Y + 1][i],
+          row[SHEAR_Y + 2][i], row[SIGN][i], &row[APEX + VX][i], &row[APEX + VY][i],
+          &row[APEX + VZ][i], &row[APEX + VLOW][i]);
+  }
+  if (mesh->location != AT_POINTS)
+    for (int i = 0; i < n; i++) {
+      int word = integer[WORD][i];
+      row[APEX + VVALUE][i] = value_at(mesh, word >> 4, word & 3, 0);
+    }
+  word_t on_edge = 0;
+  LANES_LOOP
+  for (int i = 0; i < n; i++) {
+    word_t corner = integer[WORD][i] & 3, negative = MASK(integer[POSITIVE][i] == 0), sa, sb, sc;
+    real dx = row[APEX + VX][i], dy = row[APEX + VY][i];
+    real wa = edge(row[A + VX][i], row[A + VY][i], dx, dy, MASK(corner > 0), &sa);
+    real wb = edge(row[B + VX][i], row[B + VY][i], dx, dy, MASK(corner > 1), &sb);
+    real wc = edge(row[C + VX][i], row[C + VY][i], dx, dy, MASK(corner > 2), &sc);
+    sa ^= negative, sb ^= negative, sc ^= negative; /* the sign is that of the entry face */
+    word_t drop_a = sc & ~sb, drop_b = ~drop_a & sa & ~sc, drop_c = ~(drop_a | drop_b);
+    real first = PICK(drop_c, wb, wc), second = PICK(drop_a, wb, wa);
+    real kept = PICK(drop_a, row[WEIGHT][i], PICK(drop_b, row[WEIGHT + 1][i], row[WEIGHT + 2][i]));
+    real sum = (first + second) + kept, inverse = 1 / (sum == 0 ? 1 : sum);
+    integer[LOST][i] = (int32_t)(~(sa ^ sb) & ~(sb ^ sc));
+    integer[DROP][i] = (int32_t)((drop_b & 1) | (drop_c & 2));
+    row[LEAVE][i] = first;
+    row[LEAVE + 1][i] = second;
+    row[LEAVE + 2][i] = kept;
+    row[OF_B][i] = second * inverse;
+    row[OF_C][i] = kept * inverse;
+    on_edge |= MASK(sum == 0);
+  }
+  if (on_edge) exits_on_edge(lanes, n);
+  LANES_LOOP
+  for (int i = 0; i < n; i++) {
+    int drop = integer[DROP][i], turned = (integer[WORD][i] >> 2) & 1;
+    int from_b = drop == 0, to_b = drop == 2;
+    real az = from_b ? row[B + VZ][i] : row[A + VZ][i];
+    real al = from_b ? row[B + VLOW][i] : row[A + VLOW][i];
+    real av = from_b ? row[B + VVALUE][i] : row[A + VVALUE][i];
+    real bz = to_b ? row[B + VZ][i] : row[C + VZ][i];
+    real bl = to_b ? row[B + VLOW][i] : row[C + VLOW][i];
+    real bv = to_b ? row[B + VVALUE][i] : row[C + VVALUE][i];
+    real z, z_low, value, d0 = row[DEPTH][i], d1 = row[DEPTH + 1][i];
+    crossing(az, al, av, bz, bl, bv, row[APEX + VZ][i], row[APEX + VLOW][i],
+             row[APEX + VVALUE][i], row[OF_B][i], row[OF_C][i], &z, &z_low, &value);
+    real advance = (z - d0) + (z_low - d1), chord = turned ? -advance : advance;
+    int proper = chord > 0;
+    real e0 = proper ? z : d0, e1 = proper ? z_low : d1;
+    real entry = row[BACK][i], front = entry, back = value;
+    real length = clip_at_eye(d0 + d1, e0 + e1, proper ? chord : 0, &front, &back);
+    row[DEPTH][i] = e0;
+    row[DEPTH + 1][i] = e1;
+    row[FRONT][i] = front;
+    row[BACK][i] = back;
+    row[LENGTH][i] = integer[LOST][i] ? 0 : length * row[STRETCH][i];
+    integer[FRESH][i] |= front != entry;
+  }
+}
+
+/* Through the exit face into the neighbour: names and selections. */
+static void leave(const Mesh *mesh, Lanes *lanes, int n) {
+  real(*row)[LANES] = lanes->row;
+  int32_t(*integer)[LANES] = lanes->integer;
+  const int32_t *restrict neighbors = mesh->neighbors;
+  LANES_LOOP
+  for (int i = 0; i < n; i++) {
+    int word = integer[WORD][i], corner = word & 3, drop = integer[DROP][i];
+    int exit = drop + (corner <= drop), place = corner - (corner > drop);
+    int next = neighbors[4 * (word >> 4) + exit];
+    int first = place == 0, last = place == 2, from_b = drop == 0, to_b = drop == 2;
+    integer[NEXT][i] = integer[LOST][i] ? -1 : next;
+    integer[POSITIVE][i] ^= ((corner + exit) & 1) == 0;
+    integer[FRESH][i] = 0;
+    for (int k = 0; k < VERTEX; k++) {
+      real a = row[A + k][i], b = row[B + k][i], c = row[C + k][i], d = row[APEX + k][i];
+      real p = from_b ? b : a, q = to_b ? b : c, middle = last ? q : d;
+      row[A + k][i] = first ? d : p;
+      row[B + k][i] = first ? p : middle;
+      row[C + k][i] = last ? d : q;
+    }
+    real p = row[LEAVE][i], q = row[LEAVE + 1][i], d = row[LEAVE + 2][i], middle = last ? q : d;
+    row[WEIGHT][i] = first ? d : p;
+    row[WEIGHT + 1][i] = first ? p : middle;
+    row[WEIGHT + 2][i] = last ? d : q;
+  }
+}
+
+/* Lanes that left the mesh enter again, or are handed to `done` and make room; so do those whose
+ * optical depth has reached `enough`. */
+static void settle(const World *world, Block *block, int rows, real enough,
+                   void (*done)(void *, const Lanes *, int), void *data) {
+  Lanes *lanes = &block->lanes;
+  for (int i = block->n - 1; i >= 0; i--) {
+    int ended = lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough;
+    if (lanes->integer[NEXT][i] >= 0 && !ended) continue;
+    if (!ended && !lanes->integer[LOST][i] && enter(world, block, i)) continue;
+    done(data, lanes, i);
+    move_lane(lanes, rows, --block->n, i);
+  }
+}
+
+#endif
