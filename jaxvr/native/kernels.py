@@ -15,7 +15,7 @@ from jax import lax
 
 from jaxvr.composite.over import Over, OverState
 from jaxvr.native.build import target_name
-from jaxvr.numerics.rules import Rule, rule_for
+from jaxvr.numerics.rules import Rule, rule_for, thin_rule
 from jaxvr.optics.analytic import RULES, Analytic
 from jaxvr.optics.partition import JUMP_WIDTH, Nodes
 from jaxvr.trace.raycast import CastScene
@@ -146,8 +146,10 @@ def _optics(table: Nodes, integrator: Analytic, over: Over) -> tuple[Any, ...]:
     small = RULES[integrator.accuracy]
     rule = small or rule_for(dtype)
     enough = math.inf if over.termination == 0 else -math.log(over.termination)
-    numbers = np.array([rule.depth, small is not None, enough], dtype)
-    return table.position, slabs_of(table), _rows(rule).astype(dtype), numbers
+    thin = thin_rule(dtype)
+    rows = (_rows(r).astype(dtype) for r in (rule, thin))
+    numbers = np.array([rule.depth, small is not None, thin.depth, enough], dtype)
+    return table.position, slabs_of(table), *rows, numbers
 
 
 def _rows(rule: Rule) -> np.ndarray:
@@ -158,7 +160,7 @@ def _rows(rule: Rule) -> np.ndarray:
 
 
 def slabs_of(table: Nodes) -> Array:
-    """A record for each of K + 1 slabs (K + 1, 16): `Slab` of src/slab.h."""
+    """A record for each of K + 1 slabs (K + 1, 15): see src/slab.h."""
     position = lax.stop_gradient(table.position)
     count, dtype = position.shape[0], position.dtype
     infinite = jnp.full(1, jnp.inf, dtype)
@@ -174,6 +176,6 @@ def slabs_of(table: Nodes) -> Array:
     dark_range = (jnp.where(dark, floor, jnp.inf), jnp.where(dark, ceiling, -jnp.inf))
     columns = [
         *(floor, ceiling, low, jnp.where(outermost, 0, 1 / width), *first, *(second - first)),
-        *(width, jump.astype(dtype), *dark_range),
+        *(jump.astype(dtype), *dark_range),
     ]
     return jnp.stack(columns, 1)

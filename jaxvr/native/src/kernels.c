@@ -45,20 +45,28 @@ static World world_of(XLA_FFI_CallFrame *frame) {
   return world;
 }
 
-/* positions, slabs, rule, numbers: arguments from `first` on. */
+/* A rule's rows (5, n), argument k. */
+static void load_sum(XLA_FFI_CallFrame *frame, int k, Sum *sum) {
+  const real *table = argument(frame, k);
+  int64_t n = extent(frame, k, 1);
+  memset(sum, 0, sizeof *sum);
+  real *rows[] = {sum->by_front, sum->by_back, sum->factor[0], sum->factor[1], sum->factor[2]};
+  for (int r = 0; r < 5; r++) memcpy(rows[r], table + r * n, n * sizeof(real));
+}
+
+/* positions, slabs, full rule, thin rule, numbers: arguments from `first` on. */
 static Optics optics_of(XLA_FFI_CallFrame *frame, int first) {
   Optics optics;
-  Rule *rule = &optics.rule;
   optics.transfer.count = (int)extent(frame, first, 0);
   optics.transfer.position = argument(frame, first);
   optics.transfer.slabs = argument(frame, first + 1);
-  const real *table = argument(frame, first + 2), *numbers = argument(frame, first + 3);
-  int n = rule->count = (int)extent(frame, first + 2, 1);
-  real *rows[] = {rule->by_front, rule->by_back, rule->factor[0], rule->factor[1], rule->factor[2]};
-  for (int k = 0; k < 5; k++) memcpy(rows[k], table + k * n, n * sizeof(real));
-  rule->depth = numbers[0];
-  rule->small = numbers[1] != 0;
-  optics.enough = numbers[2];
+  load_sum(frame, first + 2, &optics.rule.full);
+  load_sum(frame, first + 3, &optics.rule.thin);
+  const real *numbers = argument(frame, first + 4);
+  optics.rule.depth = numbers[0];
+  optics.rule.small = numbers[1] != 0;
+  optics.rule.limit = numbers[2];
+  optics.enough = numbers[3];
   return optics;
 }
 
@@ -84,7 +92,7 @@ static Block *new_block(Task *task) {
 
 /* ---- pictures ---- */
 
-static void keep_sums(void *data, const Lanes *lanes, int lane) {
+static void keep_sums(void *data, Lanes *lanes, int lane) {
   Task *task = data;
   int64_t n = task->count, r = lanes->integer[RAY][lane];
   for (int k = 0; k < 8; k++) task->sums[k * n + r] = lanes->row[SUMS + k][lane];
@@ -127,7 +135,7 @@ static void shade_block(void *data, int k) {
   for (int n = fill_runs(&task->nodes, lanes, first, count, ROWS); n > 0;) {
     play(&task->nodes, lanes, n);
     shade(&optics->transfer, &optics->rule, lanes, n);
-    n = settle_runs(&task->nodes, lanes, n, ROWS, optics->enough, keep_sums, task);
+    n = settle_runs(lanes, n, ROWS, optics->enough, keep_sums, task);
   }
   free(block);
 }
@@ -144,17 +152,29 @@ static void load_pixels(const Task *task, Lanes *lanes, int n) {
   }
 }
 
-static void keep_rays_bar(void *data, const Lanes *lanes, int lane) {
-  Task *task = data;
-  if (!task->rays_bar) return;
+/* One of the groups of blocks, with its share of the memory for gradients. */
+typedef struct {
+  Task *task;
+  Block *block;
+  CellBar *bar;
+  double *table;
+  real *vertices, *values;
+} Group;
+
+static void keep_bars(void *data, Lanes *lanes, int lane) {
+  Group *group = data;
+  Task *task = group->task;
   int64_t n = task->count, r = lanes->integer[RAY][lane];
-  for (int k = 0; k < 6; k++) task->rays_bar[k * n + r] = lanes->row[RBAR + k][lane];
+  if (group->table) hand_in(&task->optics.transfer, lanes, lane, group->table);
+  for (int k = 0; task->rays_bar && k < 6; k++)
+    task->rays_bar[k * n + r] = lanes->row[RBAR + k][lane];
 }
 
-static void pull_block(Task *task, Block *block, CellBar *bar, int64_t first, double *table,
-                       real *vertices, real *values) {
+static void pull_block(Group *group, int64_t first) {
+  Task *task = group->task;
   const World *world = &task->world;
   const Optics *optics = &task->optics;
+  Block *block = group->block;
   Lanes *lanes = &block->lanes;
   if (task->rays_bar) clear_rays(task->rays_bar, 6, task->count, first, rays_in(task, first));
   fill_block(world, block, first, rays_in(task, first), ALL_ROWS);
@@ -162,49 +182,42 @@ static void pull_block(Task *task, Block *block, CellBar *bar, int64_t first, do
   while (block->n) {
     int n = block->n;
     arrive(&world->mesh, lanes, n);
-    pull_shading(&optics->transfer, &optics->rule, lanes, n, table);
-    if (vertices || task->rays_bar) pull_cells(lanes, n, bar);
-    if (vertices) scatter_cells(&world->mesh, lanes, n, bar, vertices, values);
+    pull_shading(&optics->transfer, &optics->rule, lanes, n, group->table);
+    if (group->vertices || task->rays_bar) pull_cells(lanes, n, group->bar);
+    if (group->vertices)
+      scatter_cells(&world->mesh, lanes, n, group->bar, group->vertices, group->values);
     leave(&world->mesh, lanes, n);
-    settle(world, block, ALL_ROWS, optics->enough, keep_rays_bar, task);
+    settle(world, block, ALL_ROWS, optics->enough, keep_bars, group);
+  }
+}
+
+static void pull_run_block(Group *group, int64_t first) {
+  Task *task = group->task;
+  const Optics *optics = &task->optics;
+  Lanes *lanes = &group->block->lanes;
+  int n = fill_runs(&task->nodes, lanes, first, rays_in(task, first), ALL_ROWS);
+  load_pixels(task, lanes, n);
+  while (n > 0) {
+    play(&task->nodes, lanes, n);
+    pull_shading(&optics->transfer, &optics->rule, lanes, n, group->table);
+    scatter_nodes(lanes, n, task->scalar, task->length);
+    n = settle_runs(lanes, n, ALL_ROWS, optics->enough, keep_bars, group);
   }
 }
 
 /* Blocks g, g + groups, ... into the gradients of group g: the order of sums is always the same. */
 static void pull_group(void *data, int g) {
   Task *task = data;
-  Block *block = new_block(task);
-  CellBar *bar = aligned(sizeof(CellBar));
-  if (block && bar)
-    for (int64_t k = g; k * LANES < task->count; k += task->groups)
-      pull_block(task, block, bar, k * LANES,
-                 task->table_bar ? task->table_bar + g * task->table_size : NULL,
-                 task->vertices_bar ? task->vertices_bar + g * task->vertices_size : NULL,
-                 task->values_bar ? task->values_bar + g * task->values_size : NULL);
-  else atomic_store(&task->failed, 1);
-  free(block);
-  free(bar);
-}
-
-static void pull_runs_group(void *data, int g) {
-  Task *task = data;
-  const Optics *optics = &task->optics;
-  Block *block = new_block(task);
-  if (!block) return;
-  Lanes *lanes = &block->lanes;
-  double *table = task->table_bar ? task->table_bar + g * task->table_size : NULL;
-  for (int64_t k = g; k * LANES < task->count; k += task->groups) {
-    int64_t first = k * LANES;
-    int n = fill_runs(&task->nodes, lanes, first, rays_in(task, first), ALL_ROWS);
-    load_pixels(task, lanes, n);
-    while (n > 0) {
-      play(&task->nodes, lanes, n);
-      pull_shading(&optics->transfer, &optics->rule, lanes, n, table);
-      scatter_nodes(lanes, n, task->scalar, task->length);
-      n = settle_runs(&task->nodes, lanes, n, ALL_ROWS, optics->enough, keep_rays_bar, task);
-    }
-  }
-  free(block);
+  Group group = {task, new_block(task), aligned(sizeof(CellBar)), NULL, NULL, NULL};
+  if (task->table_bar) group.table = task->table_bar + g * task->table_size;
+  if (task->vertices_bar) group.vertices = task->vertices_bar + g * task->vertices_size;
+  if (task->values_bar) group.values = task->values_bar + g * task->values_size;
+  if (!group.bar) atomic_store(&task->failed, 1);
+  for (int64_t k = g; !atomic_load(&task->failed) && k * LANES < task->count; k += task->groups)
+    if (task->nodes.scalar) pull_run_block(&group, k * LANES);
+    else pull_block(&group, k * LANES);
+  free(group.block);
+  free(group.bar);
 }
 
 /* Sums the groups' gradients: part k of many. */
@@ -268,7 +281,7 @@ EXPORT Failure jaxvr_shade(XLA_FFI_CallFrame *frame) {
 EXPORT Failure jaxvr_render_pull(XLA_FFI_CallFrame *frame) {
   if (asks_metadata(frame)) return NULL;
   Task task = {.world = world_of(frame), .optics = optics_of(frame, 10),
-               .finals = argument(frame, 14), .pixel_bar = argument(frame, 15),
+               .finals = argument(frame, 15), .pixel_bar = argument(frame, 16),
                .groups = thread_count(frame), .table_size = size_of(frame, 0),
                .vertices_size = size_of(frame, 1), .values_size = size_of(frame, 2)};
   task.count = task.world.rays.count;
@@ -299,8 +312,8 @@ EXPORT Failure jaxvr_render_pull(XLA_FFI_CallFrame *frame) {
 EXPORT Failure jaxvr_shade_pull(XLA_FFI_CallFrame *frame) {
   if (asks_metadata(frame)) return NULL;
   Task task = {.nodes = nodes_of(frame), .optics = optics_of(frame, 4),
-               .count = extent(frame, 2, 0), .finals = argument(frame, 8),
-               .pixel_bar = argument(frame, 9), .groups = thread_count(frame),
+               .count = extent(frame, 2, 0), .finals = argument(frame, 9),
+               .pixel_bar = argument(frame, 10), .groups = thread_count(frame),
                .table_size = size_of(frame, 0)};
   int64_t scalars = size_of(frame, 1), lengths = size_of(frame, 2);
   task.scalar = scalars ? memset(result(frame, 1), 0, scalars * sizeof(real)) : NULL;
@@ -308,7 +321,7 @@ EXPORT Failure jaxvr_shade_pull(XLA_FFI_CallFrame *frame) {
   double *tables = calloc(task.groups * task.table_size + 1, sizeof(double));
   if (!tables) return no_memory(frame);
   task.table_bar = task.table_size ? tables : NULL;
-  Failure failure = in_parallel(frame, task.groups, pull_runs_group, &task);
+  Failure failure = in_parallel(frame, task.groups, pull_group, &task);
   if (task.table_bar) sum_tables(frame, &task);
   free(tables);
   return finish(frame, &task, failure);
@@ -316,14 +329,14 @@ EXPORT Failure jaxvr_shade_pull(XLA_FFI_CallFrame *frame) {
 
 /* ---- segments to be kept ---- */
 
-static void keep_number(void *data, const Lanes *lanes, int lane) {
+static void keep_number(void *data, Lanes *lanes, int lane) {
   Task *task = data;
   int64_t r = lanes->integer[RAY][lane];
   task->number[r] = lanes->integer[SLAB][lane];
   task->status[r] = lanes->integer[LOST][lane] ? STATUS_LOST : 0;
 }
 
-static void keep_nothing(void *data, const Lanes *lanes, int lane) {
+static void keep_nothing(void *data, Lanes *lanes, int lane) {
   (void)data, (void)lanes, (void)lane;
 }
 

@@ -1,4 +1,5 @@
-/* Segments that were traced before, played back: see trace/recorded.py. NEXT is a lane's node. */
+/* Segments that were traced before, played back: see trace/recorded.py. NEXT is a lane's node, END the
+ * one behind its last. */
 #ifndef JAXVR_PLAY_H
 #define JAXVR_PLAY_H
 
@@ -20,6 +21,7 @@ static int fill_runs(const Nodes *nodes, Lanes *lanes, int64_t first, int count,
     lanes->row[BACK][n] = nodes->scalar[nodes->first[r]];
     lanes->integer[RAY][n] = (int32_t)r;
     lanes->integer[NEXT][n] = nodes->first[r];
+    lanes->integer[END][n] = nodes->end[r];
     lanes->integer[SLAB][n] = 0;
     lanes->integer[LOST][n] = 0;
     lanes->integer[FRESH][n] = 1;
@@ -44,12 +46,18 @@ static void play(const Nodes *nodes, Lanes *lanes, int n) {
 }
 
 /* Lanes whose run or ray has ended are handed to `done` and make room; FRESH is cleared. */
-static int settle_runs(const Nodes *nodes, Lanes *lanes, int n, int rows, real enough,
-                       void (*done)(void *, const Lanes *, int), void *data) {
-  for (int i = n - 1; i >= 0; i--) {
+static int settle_runs(Lanes *lanes, int n, int rows, real enough,
+                       void (*done)(void *, Lanes *, int), void *data) {
+  word_t any = 0;
+  LANES_LOOP
+  for (int i = 0; i < n; i++) {
     lanes->integer[FRESH][i] = 0;
+    word_t through = MASK(lanes->integer[NEXT][i] + 1 >= lanes->integer[END][i]);
+    any |= through | MASK(lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough);
+  }
+  for (int i = n - 1; any && i >= 0; i--) {
     int ended = lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough;
-    if (!ended && lanes->integer[NEXT][i] + 1 < nodes->end[lanes->integer[RAY][i]]) continue;
+    if (!ended && lanes->integer[NEXT][i] + 1 < lanes->integer[END][i]) continue;
     done(data, lanes, i);
     move_lane(lanes, rows, --n, i);
   }

@@ -6,21 +6,16 @@
 #include "scene.h"
 #include "shade.h"
 
-#define NODE_PAIR 10 /* position, extinction, r, g, b of a slab's lower and upper control point */
-
-/* Composites m pieces and takes the pixel's cotangent back to `pair` (NODE_PAIR, m), the ends of
- * the slabs, and to SBAR, the segments. */
-INLINE void pull_pieces(const Transfer *tf, Lanes *lanes, const Pieces *p, int m,
-                        real pair[NODE_PAIR][LANES], const int dense) {
-  const Slab *restrict slabs = tf->slabs;
+/* Composites m pieces and takes the pixel's cotangent back to TBAR, the ends of the lanes' slabs,
+ * and to SBAR, the segments. */
+INLINE void pull_pieces(Lanes *lanes, const Pieces *p, int m, const int dense) {
   LANES_LOOP
   for (int j = 0; j < m; j++) {
     int i = dense ? j : p->lane[j];
-    const Slab *slab = slabs + p->slab[j];
     real through = exp_minus(lanes->row[SUMS][i], lanes->row[SUMS + 4][i]);
     real length = p->length[j], w = p->w[j], w_back = p->w_back[j];
     real tau_front = p->front[0][j], tau_back = tau_front + p->change[0][j];
-    real a = tau_front * length, b = tau_back * length;
+    real a = p->a[j], b = p->b[j];
     real sum = lanes->row[SUMS][i], excess = lanes->row[SUMS + 4][i];
     add_to(&sum, &excess, (real)0.5 * (a + b));
     lanes->row[SUMS][i] = sum;
@@ -50,41 +45,34 @@ INLINE void pull_pieces(const Transfer *tf, Lanes *lanes, const Pieces *p, int m
     real place0 = p->place[0][j], place1 = p->place[1][j], t0 = p->t[0][j], t1 = p->t[1][j];
     real move0 = 0, move1 = 0;
     for (int c = 0; c < 4; c++) {
-      real change = slab->change[c];
-      move0 += front_bar[c] * change;
-      move1 += back_bar[c] * change;
-      pair[1 + c][j] = front_bar[c] * (1 - place0) + back_bar[c] * (1 - place1);
-      pair[6 + c][j] = front_bar[c] * place0 + back_bar[c] * place1;
+      real across = lanes->row[RECORD + CHANGE + c][i];
+      move0 += front_bar[c] * across;
+      move1 += back_bar[c] * across;
+      lanes->row[TBAR + 1 + c][i] += front_bar[c] * (1 - place0) + back_bar[c] * (1 - place1);
+      lanes->row[TBAR + 6 + c][i] += front_bar[c] * place0 + back_bar[c] * place1;
     }
-    move0 /= p->width[j], move1 /= p->width[j];
-    pair[0][j] = -(move0 * (1 - place0) + move1 * (1 - place1));
-    pair[5][j] = -(move0 * place0 + move1 * place1);
+    move0 *= lanes->row[RECORD + SLOPE][i], move1 *= lanes->row[RECORD + SLOPE][i];
+    lanes->row[TBAR][i] -= (move0 * (1 - place0) + move1 * (1 - place1));
+    lanes->row[TBAR + 5][i] -= (move0 * place0 + move1 * place1);
     lanes->row[SBAR][i] += move0 * (1 - t0) + move1 * (1 - t1);
     lanes->row[SBAR + 1][i] += move0 * t0 + move1 * t1;
     lanes->row[SBAR + 2][i] += (a_bar * tau_front + b_bar * tau_back) * p->fraction[j];
   }
 }
 
-/* All pieces of the lanes' segments; `table` (2 K, NODE_PAIR), or NULL if not asked for: row
- * left + right of a slab's control points. */
+/* All pieces of the lanes' segments. table: see `hand_in`, or NULL if it is not asked for. */
 static void pull_shading(const Transfer *tf, const Rule *rule, Lanes *lanes, int n,
                          double *table) {
   Pieces p;
-  _Alignas(64) real pair[NODE_PAIR][LANES];
   for (int k = 0; k < 3; k++) memset(lanes->row[SBAR + k], 0, n * sizeof(real));
-  int m = begin_segments(tf, lanes, n, 1, p.lane);
+  int m = begin_segments(tf, lanes, n, 1, p.lane, table);
   while (m > 0) {
-    cut(tf, lanes, &p, m, m == n, 1);
-    integrate(rule, &p, m, 1);
-    if (m == n) pull_pieces(tf, lanes, &p, m, pair, 1);
-    else pull_pieces(tf, lanes, &p, m, pair, 0);
-    if (table)
-      for (int j = 0; j < m; j++) {
-        int k = p.slab[j], left = k > 0 ? k - 1 : 0, right = k < tf->count ? k : tf->count - 1;
-        double *row = table + NODE_PAIR * (left + right);
-        for (int c = 0; c < NODE_PAIR; c++) row[c] += pair[c][j];
-      }
-    m = go_on(&p, m);
+    int dense = m == n;
+    cut(lanes, &p, m, dense, 1);
+    integrate(rule, &p, m);
+    if (dense) pull_pieces(lanes, &p, m, 1);
+    else pull_pieces(lanes, &p, m, 0);
+    m = go_on(tf, lanes, &p, m, dense, table);
   }
 }
 

@@ -17,6 +17,8 @@ typedef int64_t word_t;
 #define REAL_MIN DBL_MIN
 #define REAL_EPS DBL_EPSILON
 #define EXP_TERMS 13
+#define FULL_NODES 23
+#define THIN_NODES 9
 #define EXP_LOWEST -708.0
 #define LN2_HIGH 0x1.62e42fee00000p-1
 #define LN2_LOW 0x1.a39ef35793c76p-33
@@ -33,6 +35,8 @@ typedef int32_t word_t;
 #define REAL_MIN FLT_MIN
 #define REAL_EPS FLT_EPSILON
 #define EXP_TERMS 7
+#define FULL_NODES 13
+#define THIN_NODES 5
 #define EXP_LOWEST -87.0f
 #define LN2_HIGH 0x1.62e400p-1f
 #define LN2_LOW 0x1.7f7d1cp-20f

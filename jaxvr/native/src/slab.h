@@ -3,30 +3,35 @@
 #ifndef JAXVR_SLAB_H
 #define JAXVR_SLAB_H
 
-#include "real.h"
+#include "lanes.h"
 
-#define MOST_NODES 32
 #define JUMP_WIDTH ((real)1e-20)
 
-/* by_front, by_back, and weights times the Bernstein basis of degree 2, at n nodes. `small`: the
- * rule errs by more than rounding, so that alpha comes from the depth. */
+/* by_front, by_back, and weights times the Bernstein basis of degree 2, at each node. Rules with
+ * fewer than FULL_NODES or THIN_NODES are filled up with zeros: loops want a constant to unroll. */
 typedef struct {
-  int count, small;
-  real depth, by_front[MOST_NODES], by_back[MOST_NODES], factor[3][MOST_NODES];
+  real by_front[FULL_NODES], by_back[FULL_NODES], factor[3][FULL_NODES];
+} Sum;
+
+/* `full` sees slabs to optical depth `depth`. `thin` has fewer nodes and is as exact where neither
+ * a nor b is above `limit`, as in most cells. `small`: `full` errs by more than rounding, so that
+ * alpha comes from the depth. */
+typedef struct {
+  Sum full, thin;
+  int small;
+  real depth, limit;
 } Rule;
 
-/* Slab k of K + 1, between control points k - 1 and k (the outermost have one twice). dark_from to
- * dark_to: its scalars if it is transparent, else none. */
-typedef struct {
-  real floor, ceiling, low, slope;      /* slope: 1 / width, 0 outside the control points */
-  real left[4], change[4];              /* extinction, r, g, b at the lower end; upper - lower */
-  real width, jump, dark_from, dark_to;
-} Slab;
+/* Numbers of slab k of K + 1, between control points k - 1 and k (the outermost have one twice):
+ * its borders, the lower control point, 1 / width (0 outside the control points), extinction, r, g,
+ * b there and their change to the upper one, whether it is a jump, and its scalars if it is
+ * transparent (none if not). */
+enum { FLOOR, CEILING, LOW, SLOPE, LEFT, CHANGE = LEFT + 4, JUMP = CHANGE + 4, DARK_FROM, DARK_TO };
 
 typedef struct {
   int count; /* control points */
   const real *position;
-  const Slab *slabs;
+  const real *slabs; /* (K + 1, SLAB_NUMBERS) */
 } Transfer;
 
 /* Number of control points at or below s. */
@@ -40,22 +45,34 @@ static inline int locate(const Transfer *tf, real s) {
   return low;
 }
 
-/* Moments B0, B1, B2 of the transmittance along a slab with end depths a and b, >= 0. */
-INLINE void moments(const Rule *rule, const int count, real a, real b, real *b0, real *b1,
-                    real *b2) {
-  real depth2 = 2 * rule->depth;
-  real inside = a * a + depth2 * (b - a);
-  real visible = depth2 / (a + SQRT(most(inside, 0)));
-  visible = visible < 1 ? visible : 1;
-  real hidden = 1 - visible, front = a * visible, back = visible * (a * hidden + b * visible);
-  real l0 = 0, l1 = 0, l2 = 0;
-#pragma GCC unroll 32
-  for (int k = 0; k < count; k++) {
-    real t = exp_negative(-muladd(front, rule->by_front[k], back * rule->by_back[k]));
-    l0 = muladd(rule->factor[0][k], t, l0);
-    l1 = muladd(rule->factor[1][k], t, l1);
-    l2 = muladd(rule->factor[2][k], t, l2);
+/* Sums over the nodes of a rule, for the depths a and b of what the rule sees. Written out, since
+ * a loop over lanes with a loop in it is not turned into vectors; `count` is a constant. */
+#define NODE(k)                                                                      \
+  if (k < count) {                                                                   \
+    real t = exp_negative(-muladd(a, sum->by_front[k], b * sum->by_back[k]));        \
+    s0 = muladd(sum->factor[0][k], t, s0);                                           \
+    s1 = muladd(sum->factor[1][k], t, s1);                                           \
+    s2 = muladd(sum->factor[2][k], t, s2);                                           \
   }
+INLINE void sum_nodes(const Sum *sum, const int count, real a, real b, real *l0, real *l1,
+                      real *l2) {
+  real s0 = 0, s1 = 0, s2 = 0;
+  NODE(0) NODE(1) NODE(2) NODE(3) NODE(4) NODE(5) NODE(6) NODE(7) NODE(8) NODE(9) NODE(10) NODE(11)
+  NODE(12)
+#if FULL_NODES > 13
+  NODE(13) NODE(14) NODE(15) NODE(16) NODE(17) NODE(18) NODE(19) NODE(20) NODE(21) NODE(22)
+#endif
+  *l0 = s0, *l1 = s1, *l2 = s2;
+}
+
+/* Moments B0, B1, B2 of the transmittance along a slab with end depths a and b, >= 0. */
+INLINE void moments(const Rule *rule, real a, real b, real *b0, real *b1, real *b2) {
+  real depth2 = 2 * rule->depth, l0, l1, l2;
+  real inside = a * a + depth2 * (b - a);
+  real visible = depth2 / most(a + SQRT(most(inside, 0)), depth2); /* at most 1 */
+  real hidden = 1 - visible;
+  sum_nodes(&rule->full, FULL_NODES, a * visible, visible * (a * hidden + b * visible), &l0, &l1,
+            &l2);
   *b0 = visible * (l0 + hidden * l1 + hidden * hidden * l2);
   *b1 = visible * visible * (l1 + 2 * hidden * l2);
   *b2 = visible * visible * visible * l2;

@@ -151,14 +151,23 @@ static void arrive(const Mesh *mesh, Lanes *lanes, int n) {
   const real *restrict vertices = mesh->vertices;
   const int32_t *restrict cells = mesh->cells;
   if (mesh->location != AT_POINTS || mesh->seams) reload_values(mesh, lanes, n);
+  /* One kind of access at a time, so that as many as possible wait for memory together; and what
+   * `leave` will want, while there is other work. */
   LANES_LOOP
   for (int i = 0; i < n; i++) {
     int word = integer[NEXT][i];
-    int point = cells[4 * (word >> 4) + (word & 3)];
+    integer[POINT][i] = cells[4 * (word >> 4) + (word & 3)];
+    integer[WORD][i] = word;
+  }
+  for (int i = 0; i < n; i++) __builtin_prefetch(vertices + 4 * (int64_t)integer[POINT][i]);
+  for (int i = 0; i < n; i++)
+    __builtin_prefetch(mesh->neighbors + 4 * (int64_t)(integer[WORD][i] >> 4));
+  LANES_LOOP
+  for (int i = 0; i < n; i++) {
+    int point = integer[POINT][i];
     real px = vertices[4 * point + integer[AXES][i]];
     real py = vertices[4 * point + integer[AXES + 1][i]];
     real pz = vertices[4 * point + integer[AXES + 2][i]];
-    integer[WORD][i] = word;
     row[APEX + VVALUE][i] = vertices[4 * point + 3];
     shear(px, py, pz, row[ORIGIN][i], row[ORIGIN + 1][i], row[ORIGIN + 2][i], row[SHEAR_X][i],
           row[SHEAR_X + 1][i], row[SHEAR_X + 2][i], row[SHEAR_Y][i], row[SHEAR_Y + 1][i],
@@ -251,9 +260,15 @@ static void leave(const Mesh *mesh, Lanes *lanes, int n) {
 /* Lanes that left the mesh enter again, or are handed to `done` and make room; so do those whose
  * optical depth has reached `enough`. */
 static void settle(const World *world, Block *block, int rows, real enough,
-                   void (*done)(void *, const Lanes *, int), void *data) {
+                   void (*done)(void *, Lanes *, int), void *data) {
   Lanes *lanes = &block->lanes;
-  for (int i = block->n - 1; i >= 0; i--) {
+  word_t any = 0;
+  LANES_LOOP
+  for (int i = 0; i < block->n; i++) {
+    word_t out = MASK(lanes->integer[NEXT][i] < 0);
+    any |= out | MASK(lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough);
+  }
+  for (int i = block->n - 1; any && i >= 0; i--) {
     int ended = lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough;
     if (lanes->integer[NEXT][i] >= 0 && !ended) continue;
     if (!ended && !lanes->integer[LOST][i] && enter(world, block, i)) continue;
