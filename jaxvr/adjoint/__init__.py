@@ -10,6 +10,11 @@ mode elsewhere.
 | `Forward` | forward | that of the result | few parameters, `jvp`, `jacfwd` |
 | `Direct` | forward, reverse | grows with cells per ray | small problems, as a check |
 
+All of them give one image and one gradient. Where rays end early (`Over(termination=...)`), that is
+the gradient of the truncated image, and all end behind the same segments. Stretches without
+extinction are passed in one piece by `Replay` only: the others differentiate the walk that they
+make, and extinction has a derivative at 0 too.
+
 A new adjoint is one file with one class, listed here and in the tests' registry.
 """
 

@@ -1,7 +1,9 @@
 """What an adjoint is, and the march along rays that all of them share.
 
 One iteration takes the piece at each ray's cursor, composites it, and moves the rays whose segment
-is finished to their next. Rays in a batch go in lock step; a batch ends with its last ray.
+is finished to their next. A ray that needs nothing from behind, as the compositor says, stops at
+the end of its segment, with every adjoint alike. Rays in a batch go in lock step; a batch ends with
+its last ray.
 """
 
 from __future__ import annotations
@@ -81,12 +83,20 @@ def shade_piece(pipeline: Pipeline, operands: Operands, march: March):
     return pixel, cursor, finished, piece
 
 
-def advance(
-    pipeline: Pipeline, operands: Operands, march: March, cursor: Cursor, finished: Array
-) -> tuple[Any, Cursor]:
-    """The next segments of finished and waiting rays, with cursors at their starts."""
-    idle = ~march.trace.active
-    trace = pipeline.tracer.step(operands.scene, operands.rays, march.trace, finished)
+def advance(pipeline: Pipeline, operands: Operands, march: March, finished: Array) -> March:
+    """The next segments of finished and waiting rays, with cursors at their starts.
+
+    Args:
+      march: pixel and cursor are those behind the current pieces. finished (R,): by these pieces.
+    """
+    trace, cursor, pixel = march
+    ended = pipeline.compositor.ended(pixel)
+    if ended is not None:
+        # Not inside of a segment: the derivative with respect to where a piece ends is left out,
+        # since it cancels between the pieces of a segment (see `optics.partition`).
+        trace = trace._replace(active=trace.active & ~(ended & finished))
+    idle = ~trace.active
+    trace = pipeline.tracer.step(operands.scene, operands.rays, trace, finished)
     front = lax.stop_gradient(trace.segment.front)
     cursor = Cursor(jnp.where(finished | idle, front, cursor.scalar), cursor.slab)
 
@@ -94,13 +104,13 @@ def advance(
         anew = pipeline.integrator.start(operands.table, front)
         return jax.tree.map(lambda a, b: jnp.where(trace.fresh, a, b), anew, cursor)
 
-    return trace, lax.cond(jnp.any(trace.fresh), found, lambda c: c, cursor)
+    cursor = lax.cond(jnp.any(trace.fresh), found, lambda c: c, cursor)
+    return March(trace, cursor, pixel)
 
 
 def iterate(pipeline: Pipeline, operands: Operands, march: March) -> March:
     pixel, cursor, finished, _ = shade_piece(pipeline, operands, march)
-    trace, cursor = advance(pipeline, operands, march, cursor, finished)
-    return March(trace, cursor, pixel)
+    return advance(pipeline, operands, March(march.trace, cursor, pixel), finished)
 
 
 def march_while(pipeline: Pipeline, operands: Operands) -> March:

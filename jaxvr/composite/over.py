@@ -10,11 +10,21 @@ digits, and opaque ones can be differentiated, since nothing is divided by a tra
 
 The second is the light from behind piece i: final minus prefix, with the arithmetic of the
 forward pass, so that the difference cancels to zero where nothing is behind.
+
+What is behind piece i is seen through T_{i+1} = exp(-sum_{j <= i} S_j), so a ray may end there once
+that is small (early ray termination, Levoy 1990). With colours of at most C in size, the sums are
+then short of
+
+    |sum_{j > i} T_j c_j| <= C (T_{i+1} - T_end) <= C T_{i+1}        0 <= T_{i+1} - T_end <= T_{i+1}
+
+since a piece of depth S emits at most C (1 - exp(-S)), which telescopes.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
+import numbers
 from typing import Any, NamedTuple
 
 import jax
@@ -36,7 +46,32 @@ class OverState(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Over:
-    """Emission and absorption (the density emitter of Williams and Max 1992), front to back."""
+    """Emission and absorption (the density emitter of Williams and Max 1992), front to back.
+
+    termination: a ray ends behind the first segment where its transmittance is at most this; 0
+    never ends one before its last segment, and costs nothing. What is left out is bounded, whatever
+    lies behind: |rgb - exact| is at most `termination` times the largest colour, and exact alpha -
+    alpha is from 0 to `termination`, both to rounding. 1/255 cannot be seen in 8 bits. Rays of a
+    batch go in lock step, so time is saved where all of them end early.
+
+    Gradients are those of the image that is rendered, with the cells where rays end held fixed:
+    what lies behind them has none. As a function of the parameters that image has steps, of the
+    size of the bound, where a ray comes to end one cell sooner.
+
+    Raises:
+      ValueError: if `termination` is not a number in [0, 1).
+    """
+
+    termination: float = 0.0
+
+    def __post_init__(self):
+        number = isinstance(self.termination, numbers.Real)
+        if not (number and 0 <= self.termination < 1):
+            raise ValueError(
+                f"termination must be a number in [0, 1), but is {self.termination!r}. It is the "
+                "transmittance at which a ray ends: 0 follows every ray to its last segment, "
+                "1 / 255 leaves out what 8 bits cannot show."
+            )
 
     def start(self, rays: int, dtype: Any) -> OverState:
         zero, zeros = jnp.zeros(rays, dtype), jnp.zeros((3, rays), dtype)
@@ -49,6 +84,12 @@ class Over:
             compensated.add(state.depth, depth),
             compensated.add(state.rgb, through[None] * rgb),
         )
+
+    def ended(self, state: OverState) -> Array | None:
+        """Rays (R,) that need nothing from behind; None if no ray ever ends so."""
+        if self.termination == 0:
+            return None
+        return compensated.value(state.depth) >= -math.log(self.termination)
 
     def finish(self, state: OverState) -> Array:
         """Premultiplied RGBA (4, R)."""

@@ -9,6 +9,7 @@ treats whole segments at once (a pre-integrated table) derives from `AbstractInt
 from __future__ import annotations
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -25,9 +26,12 @@ from jaxvr.optics.partition import (
     cut,
     ends,
     gather,
+    is_empty,
     locate,
     look_up,
+    merge_transparent,
     nodes_of,
+    with_texture,
 )
 from jaxvr.optics.transfer import TransferFunction
 
@@ -59,6 +63,14 @@ class AbstractIntegrator(abc.ABC):
         """The table that `step` looks up, differentiable with respect to `transfer`.
 
         longest (): a bound on the length of a segment, a constant to derivatives.
+        """
+
+    @abc.abstractmethod
+    def shorten(self, table: Any, image_only: bool) -> Any:
+        """A table with fewer pieces to walk, where what is transparent can be passed at once.
+
+        The image is that of `table`, and so are its derivatives with respect to segments unless
+        `image_only`. Not for derivatives with respect to the table.
         """
 
     @abc.abstractmethod
@@ -122,6 +134,10 @@ class AbstractSlabIntegrator(AbstractIntegrator):
     def prepare(self, transfer, dtype, longest):
         return nodes_of(transfer, dtype)
 
+    def shorten(self, table, image_only):
+        nodes = dataclasses.replace(merge_transparent(table), image_only=image_only)
+        return nodes if table.texture is None else with_texture(nodes, table.texture.shape[0])
+
     def start(self, table, scalar):
         scalar = jax.lax.stop_gradient(scalar)
         if table.texture is not None:  # found there, at each step
@@ -133,6 +149,8 @@ class AbstractSlabIntegrator(AbstractIntegrator):
         if table.texture is not None:
             cursor = stage(wanted, look_up, table, segment, cursor)
         piece, cursor, finished = stage(jnp.any(segment.length >= 0), cut, table, segment, cursor)
+        if table.image_only:
+            wanted = jnp.any((segment.length > 0) & ~is_empty(table, piece))
         slabs = stage(wanted, gather, table, piece)
         rgb, depth = stage(
             wanted, lambda *x: shade_slab(self.weights, ends(*x)), piece, segment, slabs

@@ -10,6 +10,12 @@ Two control points at one position are a slab of no width, a jump. A ray that cr
 piece of no length there, which contributes nothing but the derivative with respect to where the
 jump is.
 
+A slab is transparent if the extinction at both of its control points is 0. A run of adjacent
+transparent slabs contributes nothing wherever it is cut, so `merge_transparent` takes the control
+points inside of it away, and a segment passes the run in one piece. The image is the same, and so
+are derivatives with respect to segments. Those with respect to the transfer function are not: a
+control point of extinction 0 that has been taken away has a derivative all the same.
+
 Derivatives hold the partition fixed: the integrand is continuous across the ends of a piece, so
 the terms from moving ends cancel between neighbours (Leibniz), and no division by the difference
 of the end scalars is left. First derivatives of whole segments are exact, second ones are not.
@@ -20,13 +26,14 @@ own derivative is counted only if the segment goes through.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxvr._core.pytree import pytree
+from jaxvr._core.pytree import pytree, static
 from jaxvr.optics.transfer import TransferFunction
 
 Array = jax.Array
@@ -60,12 +67,14 @@ class Nodes:
     """A transfer function with channels first: position (K,), optical (4, K).
 
     Rows of `optical` are extinction, red, green, blue. texture (N,) int32, optional: the slab at
-    the middle of each of N equal parts of the line from the first position to the last.
+    the middle of each of N equal parts of the line from the first position to the last. image_only:
+    whether pieces without extinction may be left out, as they may where nothing is differentiated.
     """
 
     position: Array
     optical: Array
     texture: Array | None = None
+    image_only: bool = static(default=False)
 
 
 class Piece(NamedTuple):
@@ -97,12 +106,45 @@ def locate(positions: Array, scalar: Array) -> Array:
     return found.astype(jnp.int32)
 
 
+def merge_transparent(nodes: Nodes) -> Nodes:
+    """The nodes without the control points inside of runs of transparent slabs.
+
+    Shapes stay as they are: the control points that are left come first, those taken away follow
+    far beyond any scalar, with the values of the outermost slab. Without derivatives.
+    """
+    position, optical = _hold(nodes.position), _hold(nodes.optical)
+    # Slabs k and k + 1 meet at x_k. The neighbour of an outermost control point is itself.
+    empty = optical[0] == 0
+    below = jnp.concatenate([empty[:1], empty[:-1]])
+    above = jnp.concatenate([empty[1:], empty[-1:]])
+    inside = below & empty & above
+    order = jnp.argsort(inside, stable=True)
+    last = inside[order]
+    return dataclasses.replace(
+        nodes,
+        position=jnp.where(last, _beyond(position), position[order]),
+        optical=jnp.where(last[None], optical[:, -1:], optical[:, order]),
+    )
+
+
+def _beyond(positions: Array) -> Array:
+    """The position () of control points that have been taken away; finite, or 0 times it is not."""
+    return jnp.asarray(jnp.finfo(positions.dtype).max, positions.dtype)
+
+
+def _range(nodes: Nodes) -> tuple[Array, Array]:
+    """The first and the last position (), without those taken away."""
+    positions = _hold(nodes.position)
+    low = positions[0]
+    return low, jnp.max(jnp.where(positions < _beyond(positions), positions, low))
+
+
 def with_texture(nodes: Nodes, size: int) -> Nodes:
     """The same nodes, with a texture of `size` texels."""
-    low, high = _hold(nodes.position[0]), _hold(nodes.position[-1])
+    low, high = _range(nodes)
     middles = (jnp.arange(size).astype(low.dtype) + 0.5) / size
     texture = locate(nodes.position, low + (high - low) * middles)
-    return Nodes(nodes.position, nodes.optical, texture)
+    return dataclasses.replace(nodes, texture=texture)
 
 
 def look_up(nodes: Nodes, segment: Segment, cursor: Cursor) -> Cursor:
@@ -119,7 +161,7 @@ def look_up(nodes: Nodes, segment: Segment, cursor: Cursor) -> Cursor:
     """
     assert nodes.texture is not None
     count, size = nodes.position.shape[0], nodes.texture.shape[0]
-    low, high = _hold(nodes.position[0]), _hold(nodes.position[-1])
+    low, high = _range(nodes)
     width, scalar = high - low, cursor.scalar
     texel = (scalar - low) * (size / jnp.where(width > 0, width, 1))
     slab = nodes.texture[jnp.clip(texel.astype(jnp.int32), 0, size - 1)]
@@ -202,6 +244,13 @@ def gather(nodes: Nodes, piece: Piece) -> Slabs:
         jnp.stack([nodes.position[k] for k in both]),
         jnp.stack([nodes.optical[:, k] for k in both]),
     )
+
+
+def is_empty(nodes: Nodes, piece: Piece) -> Array:
+    """Pieces (R,) whose extinction is 0 from end to end: in a transparent slab, or constant at a
+    control point with extinction 0."""
+    left, right = (nodes.optical[0][k] == 0 for k in (piece.left, piece.right))
+    return left & (right | jnp.all(piece.place == 0, axis=0))
 
 
 class Ends(NamedTuple):

@@ -13,7 +13,10 @@ Array = jax.Array
 
 
 class TraceState(Protocol):
-    """What the loops read of a tracer's state. All arrays are (R,)."""
+    """What the loops read of a tracer's state, a NamedTuple. All arrays are (R,).
+
+    Loops also end rays, by making them inactive while they have a segment.
+    """
 
     @property
     def segment(self) -> Segment:
@@ -63,7 +66,10 @@ class AbstractTracer(abc.ABC):
 
     @abc.abstractmethod
     def step(self, scene: Any, rays: Any, state: Any, move: Array) -> Any:
-        """Moves the active rays in `move` (R,) to their next segment, and waiting rays to one."""
+        """Moves the active rays in `move` (R,) to their next segment, and waiting rays to one.
+
+        A ray that is neither active nor waiting stays so, and its segment gets length 0.
+        """
 
     @abc.abstractmethod
     def gradient_start(self, scene: Any, rays: Any, perturbed: tuple[Any, Any]) -> tuple[Any, Any]:
