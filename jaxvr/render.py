@@ -11,6 +11,8 @@ does.
 
 from __future__ import annotations
 
+import math
+import numbers
 from functools import partial
 from typing import Any
 
@@ -39,6 +41,9 @@ TILE = (16, 32)
 BATCH = TILE[0] * TILE[1]
 # Accelerators want many more at once; not measured yet.
 ACCELERATOR_BATCH = 1 << 18
+# Numbers that XLA keeps for each ray of a batch: 89 to render, 207 for all gradients at once
+# (differences of its own reports between batches of 2^9 and 2^16 rays; JAX's loops).
+NUMBERS_PER_RAY = 212
 
 
 def render(
@@ -51,6 +56,7 @@ def render(
     compositor: Over | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
+    budget: int | None = None,
 ) -> Array:
     """An image of a volume.
 
@@ -61,13 +67,16 @@ def render(
       tracer: `RayCast()` if None. integrator: `Analytic()`. compositor: `Over()`.
       adjoint: `Replay()`, for reverse mode; `Forward()` for forward mode, `Direct(...)` for both.
       background: opaque linear RGB (3,) behind the volume; None leaves it transparent.
+      budget: bytes for the state of the rays that march at once, beside the volume and the image;
+        None takes what measured fastest, 0.5 MB on CPUs and 220 MB on accelerators in float32.
+        Compiled loops (see `jaxvr.native`) need 0.2 MB a core whatever it is.
 
     Returns:
       image (height, width, 4): premultiplied linear RGBA in the volume's dtype, row 0 on top.
 
     Raises:
-      ValueError: for NaN or infinite operands. RenderError: if a ray could not be followed; both
-        only where values are concrete, that is not inside your own `jit`.
+      ValueError: for NaN or infinite operands, or a budget below one byte. RenderError: if a ray
+        could not be followed. Of values only where they are concrete, not inside your own `jit`.
 
     Differentiable in `volume.values`, `volume.points`, `transfer` (positions, colors, extinctions),
     `camera` (eye, target, up, fov or extent) and `background`. Notes on kinks are with `RayCast`,
@@ -77,7 +86,8 @@ def render(
     camera = _camera_of(camera, _volume_of(volume))
     transfer = _transfer_of(transfer, volume)
     image, status = _render(
-        pipeline, adjoint or Replay(), volume, camera, transfer, _background(background)
+        *(pipeline, adjoint or Replay(), _batch_size(budget, volume), volume, camera, transfer),
+        _background(background),
     )
     if is_concrete(status):
         check(status)
@@ -95,6 +105,7 @@ def render_rays(
     compositor: Over | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
+    budget: int | None = None,
     status: bool = False,
 ) -> Any:
     """The colours that rays see.
@@ -114,8 +125,8 @@ def render_rays(
     origins, directions = _rays_of(origins, directions, _volume_of(volume))
     transfer = _transfer_of(transfer, volume)
     rgba, bits = _render_rays(
-        *(pipeline, adjoint or Replay(), volume, origins, directions, transfer),
-        _background(background),
+        *(pipeline, adjoint or Replay(), _batch_size(budget, volume)),
+        *(volume, origins, directions, transfer, _background(background)),
     )
     if status:
         return rgba, bits
@@ -129,12 +140,14 @@ def trace(
     camera: Camera | tuple[Any, Any],
     *,
     tracer: AbstractTracer | None = None,
+    budget: int | None = None,
     native: bool | None = None,
 ) -> Segments:
     """The segments along the rays of a camera, to be shaded as often as you like.
 
     Args:
       camera: a camera, or rays (origins, directions) with shapes (..., 3).
+      budget: as for `render`.
       native: whether to use compiled loops (see `jaxvr.native`); None for where they can be used.
 
     Returns:
@@ -157,8 +170,8 @@ def trace(
         origins, directions = _rays_of(*camera, volume)
         shape, order = origins.shape[:-1], np.arange(origins.size // 3)
         origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
-    use = compiled.covers(native, volume.dtype, tracer)
-    counts, status = _count(tracer, use, volume, origins, directions)
+    how = (tracer, compiled.covers(native, volume.dtype, tracer), _batch_size(budget, volume))
+    counts, status = _count(*how, volume, origins, directions)
     check(status)
     # Rays of like length together: then no ray of a batch waits for the others when shaded.
     by_length = np.argsort(np.asarray(counts), kind="stable")
@@ -171,7 +184,7 @@ def trace(
     unit = 1 << max(int(start[-1]).bit_length() - 3, 10)
     total = -(-max(int(start[-1]), 1) // unit) * unit
     runs = start[:-1].astype(np.int32)
-    nodes = _fill(tracer, use, volume, origins, directions, runs, total)
+    nodes = _fill(*how, volume, origins, directions, runs, total)
     return Segments(
         nodes.scalar,
         nodes.length,
@@ -190,6 +203,7 @@ def shade(
     compositor: Over | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
+    budget: int | None = None,
 ) -> Array:
     """The image of traced segments: what `render` gives, without the walk.
 
@@ -202,63 +216,63 @@ def shade(
     """
     pipeline = Pipeline(Recorded(), integrator or Analytic(), compositor or Over())
     transfer = _transfer_of(transfer, segments)
-    return _shade(pipeline, adjoint or Replay(), segments, transfer, _background(background))
+    size = _batch_size(budget, segments)
+    return _shade(pipeline, adjoint or Replay(), size, segments, transfer, _background(background))
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _render(pipeline, adjoint, volume, camera, transfer, background):
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _render(pipeline, adjoint, size, volume, camera, transfer, background):
     # Under a user's own jit operands may be constants: XLA must not compute with them itself.
     volume, camera = lax.optimization_barrier((volume, camera))
     height, width = camera.height, camera.width
     origins, directions = (_tile(x) for x in camera.rays())
-    rgba, status = _run(pipeline, adjoint, volume, origins, directions, transfer)
+    rgba, status = _run(pipeline, adjoint, size, volume, origins, directions, transfer)
     rgba = _over(_untile(rgba, height, width), background)
     return rgba, _untile(status[:, None], height, width)[..., 0]
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _render_rays(pipeline, adjoint, volume, origins, directions, transfer, background):
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _render_rays(pipeline, adjoint, size, volume, origins, directions, transfer, background):
     shape = origins.shape[:-1]
     volume, origins, directions = lax.optimization_barrier((volume, origins, directions))
-    rgba, status = _run(
-        pipeline, adjoint, volume, origins.reshape(-1, 3), directions.reshape(-1, 3), transfer
-    )
+    rays = (origins.reshape(-1, 3), directions.reshape(-1, 3))
+    rgba, status = _run(pipeline, adjoint, size, volume, *rays, transfer)
     return _over(rgba, background).reshape(*shape, 4), status.reshape(shape)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _shade(pipeline, adjoint, segments, transfer, background):
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _shade(pipeline, adjoint, size, segments, transfer, background):
     segments = lax.optimization_barrier(segments)  # as above
     scene = pipeline.tracer.prepare(segments)
-    rays, count = _batches((segments.start[:-1], segments.start[1:]))
+    rays, count = _batches(size, (segments.start[:-1], segments.start[1:]))
     rays = pipeline.tracer.prepare_rays(scene, *rays)
     rgba = _finish(pipeline, adjoint, scene, rays, transfer, scene.scalar.dtype, count)[0]
     rgba = jnp.zeros_like(rgba).at[segments.order].set(rgba, unique_indices=True)
     return _over(rgba, background).reshape(*segments.shape, 4)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _count(tracer, native, volume, origins, directions):
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _count(tracer, native, size, volume, origins, directions):
     scene = tracer.prepare(volume)
-    rays, count = _batches((origins, directions))
+    rays, count = _batches(size, (origins, directions))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(*rays)
     found = compiled.kernels.count_nodes(scene, rays) if native else record(tracer, scene, rays)
     return tuple(x.reshape(-1)[:count] for x in found)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 6))
-def _fill(tracer, native, volume, origins, directions, start, total):
+@partial(jax.jit, static_argnums=(0, 1, 2, 7))
+def _fill(tracer, native, size, volume, origins, directions, start, total):
     scene = tracer.prepare(volume)
-    (origins, directions, start), _ = _batches((origins, directions, start))
+    (origins, directions, start), _ = _batches(size, (origins, directions, start))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
     fill_all = compiled.kernels.fill_nodes if native else partial(fill, tracer)
     return fill_all(scene, rays, start, total)
 
 
-def _run(pipeline, adjoint, volume, origins, directions, transfer):
+def _run(pipeline, adjoint, size, volume, origins, directions, transfer):
     """rgba (R, 4) and status (R,) of rays (R, 3)."""
     scene = pipeline.tracer.prepare(volume)
-    rays, count = _batches((origins, directions))
+    rays, count = _batches(size, (origins, directions))
     rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(*rays)
     return _finish(pipeline, adjoint, scene, rays, transfer, origins.dtype, count)
 
@@ -270,10 +284,18 @@ def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):
     return jnp.moveaxis(rgba, 1, 2).reshape(-1, 4)[:count], status.reshape(-1)[:count]
 
 
-def _batches(arrays: Any) -> tuple[Any, int]:
+def _batch_size(budget: Any, volume: Any) -> int:
+    """Rays that march at once."""
+    if budget is None:
+        return BATCH if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
+    if not isinstance(budget, numbers.Real) or not 1 <= budget < math.inf:
+        raise ValueError(f"budget must be a number of bytes, at least 1, but is {budget!r}.")
+    return max(int(budget) // (NUMBERS_PER_RAY * np.dtype(_dtype_of(volume)).itemsize), 1)
+
+
+def _batches(most: int, arrays: Any) -> tuple[Any, int]:
     """Arrays (R, ...) as batches (n, size, ...), the last filled up with copies; and R."""
     count = arrays[0].shape[0]
-    most = BATCH if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
     size = min(most, max(count, 1))
     number = -(-count // size)
 

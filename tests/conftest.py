@@ -46,3 +46,19 @@ def free_compiled_code():
 @pytest.fixture(params=["float32", "float64"])
 def dtype(request):
     return request.param
+
+
+@pytest.fixture(scope="module", params=["compiled", "jax"])
+def loops(request):
+    """Runs a module with compiled loops, and again with JAX's own: `native=None` is either."""
+    import jaxvr.native
+
+    missing = jaxvr.native.missing
+    if request.param == "jax":
+        jaxvr.native.missing = lambda dtype="float32": "switched off by this test"
+    else:
+        assert missing("float32") is None, missing("float32")
+    jax.clear_caches()
+    yield request.param
+    jaxvr.native.missing = missing
+    jax.clear_caches()

@@ -1,4 +1,4 @@
-"""Every tracer, integrator, adjoint and kind of mesh, named once; the tests cross them all.
+"""Every tracer, integrator, compositor, adjoint and kind of mesh, named once, for tests to cross.
 
 A new implementation is one line here, with what it can do. `combinations` leaves out what a flag
 rules out, and nothing else.
@@ -24,7 +24,7 @@ class Entry:
     test_registry, whose transfer function has a jump. slope: difference of its derivative with
     respect to colours and extinctions, relative. None for both: equal to rounding, in all
     derivatives. variant: the same class as another entry, or almost; crossed with all adjoints in
-    `shade` only.
+    `shade` only. only: names of the integrators that an adjoint can do, or None for all.
     """
 
     name: str
@@ -34,6 +34,10 @@ class Entry:
     variant: bool = False
     forward: bool = True
     reverse: bool = True
+    only: tuple[str, ...] | None = None
+
+    def can(self, integrator: Entry) -> bool:
+        return self.only is None or integrator.name in self.only
 
 
 TRACERS = [Entry("RayCast", jaxvr.RayCast)]
@@ -61,9 +65,20 @@ INTEGRATORS = [
 ]
 
 ADJOINTS = [
-    Entry("Replay", jaxvr.Replay, forward=False),
+    Entry("Replay", lambda: jaxvr.Replay(native=False), forward=False),
+    Entry(
+        "compiled",
+        lambda: jaxvr.Replay(native=True),
+        forward=False,
+        only=("Analytic", "fast", "draft"),
+    ),
     Entry("Direct", lambda: jaxvr.Direct(max_steps=64)),
     Entry("Forward", jaxvr.Forward, reverse=False),
+]
+
+COMPOSITORS = [
+    Entry("Over", jaxvr.Over),
+    Entry("ending", lambda: jaxvr.Over(termination=0.5), 0.5, variant=True),
 ]
 
 
@@ -105,7 +120,7 @@ def combinations() -> Iterator[tuple[Entry, Entry, Entry, str]]:
     for tracer in TRACERS:
         for adjoint in ADJOINTS:
             for integrator in INTEGRATORS:
-                if not integrator.variant:
+                if not integrator.variant and adjoint.can(integrator):
                     yield tracer, integrator, adjoint, "point"
             for mesh in MESHES[1:]:
                 yield tracer, INTEGRATORS[0], adjoint, mesh

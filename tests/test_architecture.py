@@ -11,8 +11,8 @@ import jaxvr
 
 ROOT = Path(jaxvr.__file__).parent
 ROOMS = [
-    "_core", "numerics", "volume", "view", "optics", "order", "trace", "composite", "native", "adjoint",
-    "render", "fit", "shard", "plot",
+    "_core", "numerics", "volume", "view", "optics", "order", "trace", "composite", "native",
+    "adjoint", "render", "fit", "shard", "plot",
     "pictures", "cli", "__main__",
 ]  # fmt: skip
 FILES = sorted(p.relative_to(ROOT) for p in ROOT.rglob("*.py") if p.name != "__init__.py")

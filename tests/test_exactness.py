@@ -22,6 +22,8 @@ from experiments import exactness, lost_rays
 from jaxvr.volume import datasets
 from tests.reference import Reference
 
+pytestmark = pytest.mark.usefixtures("loops")
+
 WORST = {"float64": 1e-10, "float32": 2e-5}
 VECTORS = Path(
     os.environ.get("JAXVR_VECTORS", Path(__file__).resolve().parents[2] / "shared" / "vectors")

@@ -39,7 +39,8 @@ def setting(location: str):
     return mesh, args, (*tangents[:2], transfer, tangents[3])
 
 
-ENTRIES = {e.name: e for e in registry.TRACERS + registry.INTEGRATORS + registry.ADJOINTS}
+KINDS = (registry.TRACERS, registry.INTEGRATORS, registry.COMPOSITORS, registry.ADJOINTS)
+ENTRIES = {e.name: e for kind in KINDS for e in kind}
 WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(5, 6, 4)))
 
 
@@ -84,7 +85,14 @@ def only_optical(tangents):
 
 
 @functools.cache
-def derivative(tracer: str, integrator: str, adjoint: str, location: str, everything: bool):
+def derivative(
+    tracer: str,
+    integrator: str,
+    adjoint: str,
+    location: str,
+    everything: bool,
+    compositor: str = "Over",
+):
     """Along all parameters at once, and along colours and extinctions. `everything`: points and
     camera too, not only values and transfer function."""
     mesh, args, tangents = setting(location)
@@ -92,6 +100,7 @@ def derivative(tracer: str, integrator: str, adjoint: str, location: str, everyt
     nouns = {
         "tracer": ENTRIES[tracer].make(),
         "integrator": ENTRIES[integrator].make(),
+        "compositor": ENTRIES[compositor].make(),
         "adjoint": ENTRIES[adjoint].make(),
     }
 
@@ -133,14 +142,15 @@ def test_same_image_and_gradient(tracer, integrator, adjoint, location):
 
 
 @functools.cache
-def shaded(integrator: str, adjoint: str):
+def shaded(integrator: str, adjoint: str, compositor: str = "Over"):
     """Traced segments: derivatives with respect to their scalars and lengths too."""
     mesh, (_, _, transfer, camera), tangents = setting("point")
     segments = jaxvr.trace(mesh, camera)
     rng = np.random.default_rng(3)
     args = (segments.scalar, segments.length, transfer)
     moves = [jnp.asarray(rng.normal(size=x.shape)) for x in args[:2]]
-    nouns = {"integrator": ENTRIES[integrator].make(), "adjoint": ENTRIES[adjoint].make()}
+    names = {"integrator": integrator, "compositor": compositor, "adjoint": adjoint}
+    nouns = {noun: ENTRIES[name].make() for noun, name in names.items()}
 
     def image(args):
         scalar, length, transfer = args
@@ -151,11 +161,31 @@ def shaded(integrator: str, adjoint: str):
     return directional(image, args, (tangents, only_optical(tangents)), adjoint)
 
 
-@pytest.mark.parametrize("adjoint", registry.ADJOINTS, ids=lambda x: x.name)
-@pytest.mark.parametrize("integrator", registry.INTEGRATORS, ids=lambda x: x.name)
+@pytest.mark.parametrize(
+    "integrator, adjoint",
+    [(i, a) for i in registry.INTEGRATORS for a in registry.ADJOINTS if a.can(i)],
+    ids=lambda x: x.name,
+)
 def test_same_shaded_image_and_gradient(integrator, adjoint):
     found = shaded(integrator.name, adjoint.name)
     compare(found, shaded(integrator.name, "Direct"), shaded("Analytic", "Direct"), integrator)
+
+
+@pytest.mark.parametrize("adjoint", registry.ADJOINTS, ids=lambda x: x.name)
+@pytest.mark.parametrize("how", ["render", "shade"])
+def test_all_adjoints_end_rays_at_the_same_places(how, adjoint):
+    entry = ENTRIES["ending"]
+
+    def found(adjoint, compositor):
+        if how == "shade":
+            return shaded("Analytic", adjoint, compositor)
+        return derivative("RayCast", "Analytic", adjoint, "point", True, compositor)
+
+    (image, slopes), same = found(adjoint.name, "ending"), found("Direct", "ending")
+    exact, _ = found("Direct", "Over")
+    assert np.allclose(image, same[0], atol=1e-12)
+    assert slopes == pytest.approx(same[1], rel=1e-9)
+    assert 0.01 < np.max(np.abs(image - exact)) <= entry.error
 
 
 @pytest.mark.parametrize("location", registry.MESHES)

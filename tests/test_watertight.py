@@ -13,6 +13,8 @@ import pytest
 import jaxvr
 from jaxvr.volume import datasets
 
+pytestmark = pytest.mark.usefixtures("loops")
+
 N = 4
 RAYS = 512
 TOLERANCE = {"float64": 1e-13, "float32": 2e-6}

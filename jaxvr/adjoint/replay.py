@@ -77,8 +77,10 @@ def _run(pipeline: Pipeline, compiled: bool, operands: Operands):
     operands = operands._replace(table=pipeline.integrator.shorten(operands.table, True))
 
     if compiled:
-        nouns = (pipeline.integrator, pipeline.compositor)
-        pixel, status = native.kernels.composite(*operands, *nouns)
+        scene, rays, table = operands
+        pixel, status = native.kernels.composite(
+            scene, rays, table, pipeline.integrator, pipeline.compositor
+        )
         shape = jax.tree.leaves(operands.rays)[0].shape
         rgba = pipeline.compositor.finish(pixel).reshape(4, *shape)
         return (jnp.moveaxis(rgba, 0, 1), status.reshape(shape)), pixel
@@ -117,15 +119,16 @@ def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: An
     optical = any(jax.tree.leaves(perturbed.table))
     # Where it is transparent, segments have no gradient, but the transfer function has.
     table = operands.table if optical else integrator.shorten(operands.table, False)
-    walked = operands._replace(table=table)
     if compiled:
-        nouns = (integrator, pipeline.compositor)
         scene_bar, rays_bar, table_bar = native.kernels.pull_back(
-            *(*walked, *nouns, finals, jnp.moveaxis(rgba_bar, 1, 0).reshape(4, -1)),
-            (perturbed.scene, perturbed.rays, optical),
+            *(operands.scene, operands.rays, table, integrator, pipeline.compositor),
+            final=finals,
+            rgba_bar=jnp.moveaxis(rgba_bar, 1, 0).reshape(4, -1),
+            asked=(perturbed.scene, perturbed.rays, optical),
         )
         rays_bar = _floats(tracer.rays_cotangent(operands.rays, rays_bar))
     else:
+        walked = operands._replace(table=table)
         scene_bar, rays_bar, table_bar = _walk_again(
             pipeline, walked, finals, rgba_bar, perturbed, optical
         )

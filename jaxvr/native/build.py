@@ -24,10 +24,10 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
-import jaxlib
 
 SOURCE = Path(__file__).parent / "src"
 # No contraction and no reordering: exact predicates count on every rounding.
@@ -92,7 +92,7 @@ def build(dtype: str) -> Path:
         )
     sources = sorted(SOURCE.iterdir())
     flags = [*FLAGS, *machine_flags(), *(["-DJAXVR_DOUBLE"] if dtype == "float64" else [])]
-    parts = [*command, *flags, jaxlib.__version__, _processor(), platform.platform()]
+    parts = [*command, *flags, version("jaxlib"), _processor(), platform.platform()]
     digest = hashlib.sha256("\0".join(parts).encode())
     for file in sources:
         digest.update(file.read_bytes())

