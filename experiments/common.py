@@ -1,10 +1,13 @@
-"""What experiments share: transfer functions with features, errors of pictures, tables of numbers
-and folders for results."""
+"""What experiments share: volumes, the scene that timings use, transfer functions with features,
+errors of pictures, timing by turns, tables of numbers and folders for results."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import platform
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,90 @@ PEAKS = (
     (0.72, 0.04, 0.7),
     (0.92, 0.06, 1.0),
 )
+
+
+# Control points of the transfer function that is timed unless another number is asked for.
+POINTS = 11
+
+
+def read_volume(path: Any = None, field: str | None = None) -> jaxvr.TetMesh:
+    """A mesh in float32: any mesh file, or an .npz with points (P, 3), tets (T, 4) and fields (P,).
+
+    path: None makes a small box. field: of an .npz, the first one if None.
+    """
+    if path is None:
+        return jaxvr.datasets.box((3, 3, 3), jitter=0.2, dtype="float32")
+    if Path(path).suffix != ".npz":
+        return jaxvr.read_mesh(path, field=field, dtype="float32")
+    with np.load(path) as arrays:
+        fields = [name for name in arrays.files if name not in ("points", "tets")]
+        values = arrays[field or fields[0]]
+        cells = {"tetra": arrays["tets"]}
+        return jaxvr.TetMesh.from_cells(arrays["points"], cells, values, dtype="float32")
+
+
+def transfer_of(mesh: jaxvr.TetMesh, points: int = POINTS) -> jaxvr.TransferFunction:
+    """Control points over the field's range, optical depth of some 5 across the mesh."""
+    values = np.asarray(mesh.values)
+    rng = np.random.default_rng(0)
+    return jaxvr.TransferFunction(
+        np.linspace(values.min(), values.max(), points),
+        rng.uniform(0, 1, (points, 3)),
+        rng.uniform(0.5, 8, points) / diagonal(mesh),
+        dtype=mesh.dtype,
+    )
+
+
+def camera_of(mesh: jaxvr.TetMesh, size: int) -> jaxvr.Camera:
+    """Orthographic, along `Camera.orbit`'s direction, with the mesh filling the picture."""
+    orbit = jaxvr.Camera.orbit(mesh)
+    return jaxvr.Camera.orthographic(
+        orbit.eye, orbit.target, extent=0.8 * diagonal(mesh), width=size, height=size
+    )
+
+
+def seconds_of(
+    tasks: dict[str, Callable[[], Any]], repeat: int, *, quiet: bool = False
+) -> dict[str, list[float]]:
+    """Seconds of each task, taking turns, after one call of each that is not counted.
+
+    quiet: do not print how long those first calls took.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in tasks}
+    for name, task in tasks.items():
+        start = time.perf_counter()
+        jax.block_until_ready(task())
+        if not quiet:
+            print(f"  first {name:38s} {time.perf_counter() - start:8.2f} s", flush=True)
+    for _ in range(repeat):
+        for name, task in tasks.items():
+            start = time.perf_counter()
+            jax.block_until_ready(task())
+            seconds[name].append(time.perf_counter() - start)
+    return seconds
+
+
+def median_of(
+    tasks: dict[str, Callable[[], Any]], repeat: int, *, quiet: bool = False
+) -> dict[str, float]:
+    """The medians of `seconds_of`."""
+    every = seconds_of(tasks, repeat, quiet=quiet)
+    return {name: float(np.median(seconds)) for name, seconds in every.items()}
+
+
+def machine() -> dict[str, Any]:
+    """What the numbers of a run depend on: cores, processor, versions. No names of hosts."""
+    model, info = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    for line in lines:
+        if line.startswith("model name"):
+            model = line.split(":", 1)[1].strip()
+            break
+    if any(line.startswith("flags") and "avx512f" in line for line in lines):
+        model += " (AVX-512)"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    versions = {"python": platform.python_version(), "jax": jax.__version__}
+    return {"cores": cores, "processor": model, "device": jax.devices()[0].platform} | versions
 
 
 def diagonal(volume: Any) -> float:

@@ -10,13 +10,14 @@ and prints what XLA reserves beyond arguments and result. `Replay` keeps nothing
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxvr
-from experiments.common import write_json
+from experiments.common import camera_of, transfer_of, write_json
 
 
 def reserved(mesh: jaxvr.TetMesh, size: int, adjoint) -> int:
@@ -31,6 +32,25 @@ def reserved(mesh: jaxvr.TetMesh, size: int, adjoint) -> int:
     analysis = compiled.memory_analysis()
     assert analysis is not None
     return int(analysis.temp_size_in_bytes)
+
+
+def bytes_per_tet(mesh: jaxvr.TetMesh, size: int) -> dict[str, Any]:
+    """What a mesh takes on the device, and with it what XLA reserves beyond arguments and result to
+    render it in one compiled function: for an image of 16 x 16, and for one of size x size, whose
+    rays and pixels do not depend on the mesh. What a native kernel allocates itself is not in it.
+    """
+    transfer = transfer_of(mesh)
+
+    def needed(side: int) -> int:
+        render = jax.jit(lambda m, c, t: jaxvr.render(m, c, t))
+        compiled = render.lower(mesh, camera_of(mesh, side), transfer).compile()
+        analysis = compiled.memory_analysis()
+        assert analysis is not None
+        return mesh.nbytes + int(analysis.temp_size_in_bytes)
+
+    total = {"mesh": mesh.nbytes, "small": needed(16), "image": needed(size)}
+    per_tet = {f"{name}_per_tet": value / mesh.n_tets for name, value in total.items()}
+    return {"tets": mesh.n_tets, "size": size, "bytes": total} | per_tet
 
 
 def run(size: int, depths: list[int], steps_per_layer: int = 6) -> list[dict]:

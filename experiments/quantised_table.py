@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import jaxvr
-from experiments.common import errors, shells, table
+from experiments.common import errors, run_on_pictures, shells, table
 from jaxvr import plot
 
 TABLES = {

@@ -1,21 +1,33 @@
-"""Seconds for a render and its gradients, beside VTK's ray caster, in one run.
+"""Seconds and memory of all that jaxvr does with a mesh, beside VTK's ray caster.
 
-    python -m experiments.speed bluntfin.vtu oxygen_post.vtu --size 512 [--repeat 5] [--json FILE]
+    python tools/refine_hex.py oxygen_post.vtu post_x2.npz --n 2 --fields speed --tets
+    python -m experiments.speed bluntfin.vtu oxygen_post.vtu post_x2.npz --json F --markdown F
 
-VTK (extra `peers`) runs its unstructured ray caster with its accurate ("linear") integrator on the
-same tetrahedra, float64 scalars, the same 11 control points in colour and opacity, one ray a pixel
-and two threads; jaxvr runs in float32 with `Analytic`. The two take turns; medians and ratios are
-printed. Before anything is timed, images are compared with jaxvr's `Quadrature`, which is the
-truth here. VTK pierces a pixel at its lower left corner and draws row 0 at the bottom, and does not
-correct scalars for perspective, so both cameras are orthographic and VTK's is half a pixel off.
+The first line comes with the test data and makes the oxygen post with 4.9 million tets; an .npz has
+points, tets and a field. The second takes all measures, which are
+
+    runs       tasks that take turns, one after the other, in one process; medians. At 512 x 512 and
+               11 control points: VTK (see `peers`), render, value_and_grad with respect to each
+               class of parameters, trace, shade, and an iteration of a fit. At the other sizes, and
+               at 512 x 512 with the other numbers of control points: VTK, render and shade. Before
+               a run, its images are compared with jaxvr's `Quadrature`, which is the truth here.
+    scaling    the render of all meshes, taking turns: what more tets cost.
+    processes  first calls, without a compile cache and with a warm one, and the highest memory at
+               the largest size: each in a process of its own (see `first_call`).
+    bytes      of the mesh and of what XLA reserves to render it, for each tet (see `memory`).
+
+jaxvr runs in float32 with `Analytic` and all cores, VTK in its own double precision on `--threads`
+threads. The result is printed, with the targets and whether they are met. `--only` takes words:
+tasks whose names contain one of them (render always), or `scaling`, `first`, `memory`, `bytes`.
+With `--jax-loop`, the loop in plain JAX is timed beside the native kernel. `--cross` takes all
+sizes with all numbers of control points.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
-import os
-import time
+import dataclasses
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,216 +37,268 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvr
-from experiments.common import diagonal, write_json
+from experiments import speed_tables
+from experiments.common import (
+    POINTS,
+    camera_of,
+    machine,
+    median_of,
+    read_volume,
+    seconds_of,
+    transfer_of,
+    write_json,
+)
+from experiments.first_call import in_process
+from experiments.memory import bytes_per_tet
+from experiments.peers import Vtk
+from experiments.speed_tables import FIT, RENDER, SHADE, VTK
+from jaxvr.fit.batches import deal, gather_views, make_batches
+from jaxvr.fit.fit import Objective
+from jaxvr.fit.loop import Control, run
+from jaxvr.fit.losses import l1
+from jaxvr.fit.parameters import Parameters
 
-POINTS = 11
+__all__ = ["camera_of", "median_of", "transfer_of"]  # for other experiments
 
-
-def transfer_of(mesh: jaxvr.TetMesh) -> jaxvr.TransferFunction:
-    """11 control points over the field's range, optical depth of some 5 across the mesh."""
-    values = np.asarray(mesh.values)
-    rng = np.random.default_rng(0)
-    return jaxvr.TransferFunction(
-        np.linspace(values.min(), values.max(), POINTS),
-        rng.uniform(0, 1, (POINTS, 3)),
-        rng.uniform(0.5, 8, POINTS) / diagonal(mesh),
-        dtype=mesh.dtype,
-    )
-
-
-def camera_of(mesh: jaxvr.TetMesh, size: int) -> jaxvr.Camera:
-    """Orthographic, along `Camera.orbit`'s direction, with the mesh filling the picture."""
-    orbit = jaxvr.Camera.orbit(mesh)
-    return jaxvr.Camera.orthographic(
-        orbit.eye, orbit.target, extent=0.8 * diagonal(mesh), width=size, height=size
-    )
-
-
-def _vtk() -> tuple[Any, Any]:
-    """VTK and its NumPy bridge, which only this experiment needs (extra `peers`)."""
-    return importlib.import_module("vtk"), importlib.import_module("vtk.util.numpy_support")
+SIZE = 512
+PARTS = ("scaling", "first", "memory", "bytes")  # words of `--only` that are no tasks of runs
+Tasks = dict[str, Callable[[], Any]]
 
 
-class Vtk:
-    """VTK's ray caster on the same scene; `render` returns uint8 RGBA, row 0 on top."""
-
-    def __init__(self, mesh, camera, transfer, threads: int):
-        vtk, numpy_support = _vtk()
-        points, tets = np.asarray(mesh.points, float), _positive(mesh)
-        grid, coordinates, cells = vtk.vtkUnstructuredGrid(), vtk.vtkPoints(), vtk.vtkCellArray()
-        coordinates.SetData(numpy_support.numpy_to_vtk(points, deep=1))
-        cells.SetData(4, numpy_support.numpy_to_vtkIdTypeArray(tets.ravel(), deep=1))
-        scalars = numpy_support.numpy_to_vtk(np.asarray(mesh.values, float), deep=1)
-        scalars.SetName("s")
-        grid.SetPoints(coordinates)
-        grid.SetCells(vtk.VTK_TETRA, cells)
-        grid.GetPointData().SetScalars(scalars)
-
-        color, opacity = vtk.vtkColorTransferFunction(), vtk.vtkPiecewiseFunction()
-        nodes = (transfer.positions, transfer.colors, transfer.extinctions)
-        for x, rgb, tau in zip(*(np.asarray(a, float) for a in nodes), strict=True):
-            color.AddRGBPoint(x, *rgb)
-            opacity.AddPoint(x, tau)
-        look = vtk.vtkVolumeProperty()
-        look.SetColor(color)
-        look.SetScalarOpacity(opacity)
-        look.SetScalarOpacityUnitDistance(1.0)
-        look.ShadeOff()
-        look.SetInterpolationTypeToLinear()
-
-        mapper = vtk.vtkUnstructuredGridVolumeRayCastMapper()
-        mapper.SetInputData(grid)
-        self.integrator = vtk.vtkUnstructuredGridLinearRayIntegrator()
-        mapper.SetRayIntegrator(self.integrator)
-        mapper.SetAutoAdjustSampleDistances(0)
-        mapper.SetImageSampleDistance(1.0)
-        mapper.SetIntermixIntersectingGeometry(0)
-        mapper.SetNumberOfThreads(threads)
-        volume, renderer = vtk.vtkVolume(), vtk.vtkRenderer()
-        volume.SetMapper(mapper)
-        volume.SetProperty(look)
-        renderer.AddVolume(volume)
-        renderer.SetBackground(0, 0, 0)
-        renderer.SetBackgroundAlpha(0)
-        window = self.window = vtk.vtkRenderWindow()
-        window.SetOffScreenRendering(1)
-        window.SetMultiSamples(0)
-        window.SetAlphaBitPlanes(1)
-        window.SetSize(camera.width, camera.height)
-        window.AddRenderer(renderer)
-        view = renderer.GetActiveCamera()
-        view.SetParallelProjection(1)
-        # Half a pixel, so that VTK's lower left corners are jaxvr's centres.
-        right, true_up, _ = (np.asarray(v, float) for v in camera.basis())
-        shift = 0.5 * float(camera.extent) / camera.height * (right + true_up)
-        view.SetPosition(*(np.asarray(camera.eye, float) + shift))
-        view.SetFocalPoint(*(np.asarray(camera.target, float) + shift))
-        view.SetViewUp(*np.asarray(camera.up, float))
-        view.SetParallelScale(float(camera.extent) / 2)
-        renderer.ResetCameraClippingRange()
-        self.size, self.keep = (camera.height, camera.width), (grid, mapper, renderer)
-
-    def draw(self) -> None:
-        self.window.Render()
-
-    def image(self) -> np.ndarray:
-        vtk, numpy_support = _vtk()
-        grab = vtk.vtkWindowToImageFilter()
-        grab.SetInput(self.window)
-        grab.SetInputBufferTypeToRGBA()
-        grab.ReadFrontBufferOff()
-        grab.SetShouldRerender(0)
-        grab.Update()
-        pixels = numpy_support.vtk_to_numpy(grab.GetOutput().GetPointData().GetScalars())
-        return pixels.reshape(*self.size, 4)[::-1]
-
-
-def _positive(mesh: jaxvr.TetMesh) -> np.ndarray:
-    """Cells (T, 4) as positively oriented VTK tetrahedra."""
-    points, tets = np.asarray(mesh.points, float), np.asarray(mesh.cells).astype(np.int64)
-    corner = points[tets]
-    volume = np.einsum(
-        "ti,ti->t",
-        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]),
-        corner[:, 3] - corner[:, 0],
-    )
-    tets[volume < 0] = tets[volume < 0][:, [0, 1, 3, 2]]
-    return tets
-
-
-def median_of(
-    tasks: dict[str, Callable[[], Any]], repeat: int, *, quiet: bool = False
-) -> dict[str, float]:
-    """Median seconds of each task, taking turns, after one call of each that is not counted.
-
-    quiet: do not print how long those first calls took.
-    """
-    seconds: dict[str, list[float]] = {name: [] for name in tasks}
-    for name, task in tasks.items():
-        start = time.perf_counter()
-        jax.block_until_ready(task())
-        if not quiet:
-            print(f"  first {name:28s} {time.perf_counter() - start:8.2f} s", flush=True)
-    for _ in range(repeat):
-        for name, task in tasks.items():
-            start = time.perf_counter()
-            jax.block_until_ready(task())
-            seconds[name].append(time.perf_counter() - start)
-    return {name: float(np.median(all_)) for name, all_ in seconds.items()}
-
-
-def run(path: Path, size: int, repeat: int, peers: bool, threads: int = 2) -> dict[str, Any]:
-    mesh = jaxvr.read_mesh(path, dtype="float32")
-    camera, transfer = camera_of(mesh, size), transfer_of(mesh)
-    print(f"{path.stem}, {mesh.n_tets:,} tets, {size} x {size}", flush=True)
-
-    def render(m, t):
-        return jaxvr.render(m, camera, t)
-
-    def gradient(of):
-        return jax.jit(jax.value_and_grad(lambda x, m, t: jnp.sum(of(x, m, t) ** 2)))
-
-    by_transfer = gradient(lambda x, m, t: jaxvr.render(m, camera, x))
-    by_values = gradient(lambda x, m, t: jaxvr.render(m.replace(values=x), camera, t))
-    by_points = gradient(lambda x, m, t: jaxvr.render(m.replace(points=x), camera, t))
-    segments = jaxvr.trace(mesh, camera)
-    by_shade = jax.jit(jax.value_and_grad(lambda t, s: jnp.sum(jaxvr.shade(s, t) ** 2)))
-    tasks: dict[str, Callable[[], Any]] = {
-        "render": lambda: render(mesh, transfer),
-        "value_and_grad, transfer": lambda: by_transfer(transfer, mesh, transfer),
-        "value_and_grad, values": lambda: by_values(mesh.values, mesh, transfer),
-        "value_and_grad, points": lambda: by_points(mesh.points, mesh, transfer),
-        "trace": lambda: jaxvr.trace(mesh, camera).scalar,
-        "shade": lambda: jaxvr.shade(segments, transfer),
-        "value_and_grad, shade": lambda: by_shade(transfer, segments),
+def gradients(mesh: Any, camera: Any, transfer: Any, **keywords: Any) -> Tasks:
+    """Value and gradient of a sum of squares, compiled, for each class of parameters."""
+    scenes = {
+        "transfer": (transfer, lambda x, m, c, t: (m, c, x)),
+        "values": (mesh.values, lambda x, m, c, t: (m.replace(values=x), c, t)),
+        "points": (mesh.points, lambda x, m, c, t: (m.replace(points=x), c, t)),
+        "camera": (camera.eye, lambda x, m, c, t: (m, dataclasses.replace(c, eye=x), t)),
     }
-    image = np.asarray(render(mesh, transfer))
+
+    def task(x, scene):
+        def loss(x, *rest):
+            return jnp.sum(jaxvr.render(*scene(x, *rest), **keywords) ** 2)
+
+        compiled = jax.jit(jax.value_and_grad(loss))
+        return lambda: compiled(x, mesh, camera, transfer)
+
+    return {f"value_and_grad, {name}": task(*scene) for name, scene in scenes.items()}
+
+
+def fit_iteration(segments: Any, transfer: Any, image: Any) -> Callable[[], Any]:
+    """One iteration of `jaxvr.fit` on the cached segments of one view, of all its rays.
+
+    It is the loop of `fit` itself, for one iteration from the start: loss and gradient (L1, of
+    colours and extinctions behind their transforms), the step of Adam, and the checks of both.
+    """
+    views = gather_views(
+        *(None, [segments], [0.5 * image]), cache=True, tracer=None, background=None
+    )
+    batches, _ = make_batches(views, deal(views, None, None, 0))
+    parameters = Parameters.of(transfer)
+    unit = jnp.mean(transfer.extinctions)
+    inputs = parameters, unit, None, None, batches[0], np.zeros(2, transfer.dtype)
+    gradient, raw = Objective(l1, None, None, None, None).gradient, parameters.raw()
+    once = Control(iterations=1, progress=False)
+    return lambda: run(gradient, raw, lambda i: inputs, 1, None, 0.1, once, None, {}).parameters
+
+
+def few_tasks(mesh: Any, camera: Any, transfer: Any, segments: Any) -> Tasks:
+    """What is timed at every size and number of control points, but for VTK."""
+    return {
+        RENDER: lambda: jaxvr.render(mesh, camera, transfer),
+        SHADE: lambda: jaxvr.shade(segments, transfer),
+    }
+
+
+def all_tasks(mesh: Any, camera: Any, transfer: Any, segments: Any, image: Any) -> Tasks:
+    """What is timed at the main ones, but for VTK."""
+    by_shade = jax.jit(jax.value_and_grad(lambda t, s: jnp.sum(jaxvr.shade(s, t) ** 2)))
+    few = few_tasks(mesh, camera, transfer, segments)
+    return {
+        RENDER: few[RENDER],
+        **gradients(mesh, camera, transfer),
+        "trace": lambda: jaxvr.trace(mesh, camera).scalar,
+        SHADE: few[SHADE],
+        "value_and_grad, shade": lambda: by_shade(transfer, segments),
+        FIT: fit_iteration(segments, transfer, image),
+    }
+
+
+def jax_loop(mesh: Any, camera: Any, transfer: Any, segments: Any) -> Tasks:
+    """The same without the native kernel."""
+    replay: Any = jaxvr.Replay
+    trace: Any = jaxvr.trace
+    loop = replay(native=False)
+    tasks: Tasks = {
+        RENDER: lambda: jaxvr.render(mesh, camera, transfer, adjoint=loop),
+        **gradients(mesh, camera, transfer, adjoint=loop),
+        "trace": lambda: trace(mesh, camera, native=False).scalar,
+        SHADE: lambda: jaxvr.shade(segments, transfer, adjoint=loop),
+    }
+    return {f"{name}, JAX loop": task for name, task in tasks.items()}
+
+
+def measure(name: str, mesh: Any, vtk: Any, segments: Any, camera: Any, points: int, options: Any):
+    """One run: all tasks if this is the main scene, else VTK, render and shade."""
+    size = camera.width
+    transfer = transfer_of(mesh, points)
+    main = size == options.size and points == options.main_points
+    print(f"{name}, {mesh.n_tets:,} tets, {size} x {size}, {points} control points", flush=True)
+    image = np.asarray(jaxvr.render(mesh, camera, transfer))
+    scene = mesh, camera, transfer, segments
+    tasks = all_tasks(*scene, image) if main else few_tasks(*scene)
+    if main and options.jax_loop:
+        tasks |= jax_loop(*scene)
+    tasks = {n: task for n, task in tasks.items() if n == RENDER or wanted(n, options)}
     truth = np.asarray(
         jaxvr.render(mesh, camera, transfer, integrator=jaxvr.Quadrature(samples=12))
     )
-    result: dict[str, Any] = {
-        "mesh": path.stem,
-        "size": size,
-        "cores": os.cpu_count(),
+    result: dict[str, Any] = {"mesh": name, "tets": mesh.n_tets, "size": size, "points": points}
+    result |= {
+        "main": main,
         "segments": segments.count,
         "bytes_per_segment": segments.nbytes / max(segments.count, 1),
         "error": float(np.abs(image - truth).max()),
     }
-    if peers:
-        vtk = Vtk(mesh, camera, transfer, threads)
+    if vtk is not None:
+        vtk.show(camera, transfer)
         vtk.draw()
-        result["vtk_error"] = float(np.abs(vtk.image() / 255.0 - truth).max())
-        result["vtk_pixels_off"] = int((np.abs(vtk.image() / 255.0 - truth).max(-1) > 0.02).sum())
-
-        def draw():
-            vtk.integrator.Modified()
-            vtk.window.Modified()
-            vtk.draw()
-
-        tasks = {"VTK, linear": draw, **tasks}
-    medians = median_of(tasks, repeat)
-    result["seconds"] = medians
-    for name, seconds in medians.items():
-        beside = f"{seconds / medians['render']:6.2f} of the render"
-        if peers:
-            beside += f"   {medians['VTK, linear'] / seconds:6.2f} times VTK's speed"
-        print(f"  {name:28s} {seconds:8.3f} s   {beside}", flush=True)
-    print({k: v for k, v in result.items() if k != "seconds"}, flush=True)
+        result |= vtk.agreement(truth)
+        tasks = {VTK: vtk.draw, **tasks}
+    every = seconds_of(tasks, options.repeat)
+    result["seconds"] = {n: float(np.median(s)) for n, s in every.items()}
+    result["all_seconds"] = every
     return result
 
 
-def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
-    parser = argparse.ArgumentParser(description="jaxvr beside VTK's ray caster")
-    parser.add_argument("meshes", nargs="+", type=Path)
-    parser.add_argument("--size", type=int, default=512)
-    parser.add_argument("--repeat", type=int, default=5)
-    parser.add_argument("--no-peers", action="store_true")
-    parser.add_argument("--json")
-    options = parser.parse_args(arguments)
-    rows = [run(p, options.size, options.repeat, not options.no_peers) for p in options.meshes]
-    if options.json:
-        write_json(options.json, rows)
+def wanted(name: str, options: Any) -> bool:
+    return not options.only or any(word in name for word in options.only)
+
+
+def scenes(options: Any) -> list[tuple[int, int]]:
+    """(size, control points) of each run, the main one first, then the others of its size."""
+    if options.cross:
+        every = [(size, points) for size in options.sizes for points in options.points]
+    else:
+        every = [(size, options.main_points) for size in options.sizes]
+        every += [(options.size, points) for points in options.points]
+    first = (options.size, options.main_points)
+    return sorted(set(every), key=lambda s: (s != first, s[0] != options.size, s))
+
+
+def processes(name: str, path: Any, options: Any) -> list[dict[str, Any]]:
+    """First calls and memory, each in fresh processes: medians of seconds."""
+    rows = []
+    keywords = {"points": options.main_points, "threads": options.threads}
+
+    def take(task: str, size: int, folder: Any = None) -> None:
+        made = [
+            in_process(path, size, task, cache=folder, **keywords) for _ in range(options.processes)
+        ]
+        cache = "none" if folder is None else "warm"
+        row = made[0] | {"mesh": name, "cache": cache}
+        row["seconds"] = float(np.median([one["seconds"] for one in made]))
+        rows.append(row)
+        print(f"  process {task:10s} {cache:8s} {size:5d} {row['seconds']:8.2f} s", flush=True)
+
+    for task in ("render",) if options.tiny else ("render", "gradient"):
+        if not wanted("first", options):
+            break
+        take(task, options.size)
+        with tempfile.TemporaryDirectory() as folder:
+            in_process(path, options.size, task, cache=folder, **keywords)
+            take(task, options.size, folder)
+    largest = max(options.sizes)
+    if wanted("memory", options) and not (rows and largest == options.size):
+        take("render", largest)
+    if options.peers:
+        for size in dict.fromkeys([options.size, largest]):
+            take("vtk", size)
     return rows
+
+
+def measure_mesh(path: Any, options: Any) -> tuple[str, Any, dict[str, Any]]:
+    """All of one mesh: its name, itself, and its part of the report."""
+    name = path.stem if path is not None else "box"
+    part: dict[str, Any] = {"runs": [], "processes": [], "bytes": []}
+    if wanted("first", options) or wanted("memory", options):
+        part["processes"] = processes(name, path, options)
+    mesh = read_volume(path)
+    runs = scenes(options) if not options.only or set(options.only) - set(PARTS) else []
+    vtk = Vtk(mesh, options.threads) if options.peers and runs else None
+    traced = None
+    for size, points in runs:
+        camera = camera_of(mesh, size)
+        if traced is None or traced.shape != (size, size):
+            traced = jaxvr.trace(mesh, camera)
+        part["runs"].append(measure(name, mesh, vtk, traced, camera, points, options))
+    if wanted("bytes", options):
+        part["bytes"].append({"mesh": name} | bytes_per_tet(mesh, options.size))
+    return name, mesh, part
+
+
+def scaling(meshes: dict[str, Any], options: Any) -> list[dict[str, Any]]:
+    """The main picture of all meshes, taking turns."""
+    print(f"{', '.join(meshes)}: render in turns", flush=True)
+
+    def task(mesh):
+        camera = camera_of(mesh, options.size)
+        transfer = transfer_of(mesh, options.main_points)
+        return lambda: jaxvr.render(mesh, camera, transfer)
+
+    medians = median_of({name: task(mesh) for name, mesh in meshes.items()}, options.repeat)
+    return [
+        {"mesh": name, "tets": meshes[name].n_tets, "size": options.size, "seconds": seconds}
+        for name, seconds in medians.items()
+    ]
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("meshes", nargs="*", type=Path, help="mesh files or .npz; none: a box")
+    parser.add_argument("--sizes", nargs="+", type=int, default=[256, SIZE, 1024])
+    parser.add_argument("--points", nargs="+", type=int, default=[2, POINTS, 64, 255])
+    parser.add_argument("--repeat", type=int, default=5, help="turns of a run")
+    parser.add_argument("--processes", type=int, default=1, help="fresh processes a first call")
+    parser.add_argument("--threads", type=int, default=2, help="of VTK")
+    parser.add_argument("--no-peers", dest="peers", action="store_false")
+    parser.add_argument("--only", nargs="+", default=[], metavar="WORD")
+    parser.add_argument("--cross", action="store_true")
+    parser.add_argument("--jax-loop", action="store_true")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--markdown", type=Path)
+    parser.add_argument("--tiny", action="store_true", help="a box, 16 x 16 pixels, no VTK")
+    options = parser.parse_args(arguments)
+    if options.tiny:
+        options.sizes, options.points, options.repeat, options.peers = [16], [POINTS], 1, False
+    # The scene of all tasks: the usual one, or else the first that was asked for.
+    options.size = SIZE if SIZE in options.sizes else options.sizes[0]
+    options.main_points = POINTS if POINTS in options.points else options.points[0]
+    report: dict[str, Any] = {"machine": machine() | {"vtk_threads": options.threads}}
+    report |= {"size": options.size, "repeat": options.repeat}
+    report |= {"runs": [], "processes": [], "bytes": [], "scaling": []}
+    meshes = {}
+    for path in options.meshes or [None]:
+        name, meshes[name], part = measure_mesh(path, options)
+        for key, rows in part.items():
+            report[key] += rows
+        if options.json:  # as far as it is
+            write_json(options.json, report)
+    if len(meshes) > 1 and wanted("scaling", options):
+        report["scaling"] = scaling(meshes, options)
+    for number, row in enumerate(report["runs"], 1):
+        row["run"] = number
+    for row in report["scaling"]:
+        row["run"] = len(report["runs"]) + 1
+    report["targets"] = speed_tables.targets(report)
+    text = speed_tables.markdown(report)
+    print(text, flush=True)
+    if options.json:
+        write_json(options.json, report)
+    if options.markdown:
+        options.markdown.parent.mkdir(parents=True, exist_ok=True)
+        options.markdown.write_text(text)
+    return report
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ To add one: a function from a folder to a number, and the bounds that it must li
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,11 @@ from experiments import (
     fit_transfer,
     full_vs_partial,
     integrators,
+    layouts,
     log_table,
     preintegration_build,
     quantised_table,
+    speed,
 )
 
 
@@ -101,6 +104,27 @@ def control_points_pieces(folder: Path) -> float:
     return report["box"][10]["pieces"]
 
 
+def layouts_chord(folder: Path) -> float:
+    """The worst chord of planes, where the exact walk takes RayCast's own paths."""
+    report = layouts.main(["--tiny", "--json", str(folder / "layouts.json")])
+    (box,) = report.values()
+    for part in ("picture", "aimed"):
+        exact = box[part]["exact"]
+        assert exact["lost"] == exact["other cells"] == 0 and exact["worst chord"] < 1e-6
+    assert box["picture"]["plain"]["worst chord"] < 1e-6
+    return box["picture"]["planes"]["worst chord"]
+
+
+def speed_error(folder: Path) -> float:
+    """The largest error of a render; some of the tasks, and memory in a process of its own."""
+    files = ["--json", str(folder / "speed.json"), "--markdown", str(folder / "speed.md")]
+    report = speed.main(["--tiny", "--only", "shade", "fit", "memory", *files])
+    assert json.loads((folder / "speed.json").read_text()) == report
+    assert "| 1 | fit, one iteration |" in (folder / "speed.md").read_text()
+    assert {row["number"] for row in report["targets"]} == {3, 6, 8}
+    return report["runs"][0]["error"]
+
+
 EXPERIMENTS = [
     (demo_psnr, 25, 200),
     (fit_transfer_psnr, 25, 200),
@@ -110,6 +134,8 @@ EXPERIMENTS = [
     (full_vs_partial_error, 0, 2e-6),
     (integrators_error, 1e-9, 1e-6),
     (control_points_pieces, 1.2, 10),
+    (speed_error, 1e-9, 1e-6),
+    (layouts_chord, 1e-9, 1e-6),
 ]
 
 
