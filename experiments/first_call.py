@@ -18,8 +18,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -104,12 +106,15 @@ def first(path: Any, size: int, points: int, task: str, threads: int) -> dict[st
 def in_process(
     path: Any, size: int, task: str, *, points: int = POINTS, cache: Any = None, threads: int = 2
 ) -> dict[str, Any]:
-    """`first` in a fresh process. cache: a folder; None compiles all."""
+    """`first` in a fresh process. cache: a folder for what XLA and the C compiler make; None
+    compiles all, as on a machine that has never seen jaxvr."""
     command = [sys.executable, "-m", "experiments.first_call", "--task", task]
     command += ["--size", str(size), "--points", str(points), "--threads", str(threads)]
     command += [str(Path(path).resolve())] if path is not None else []
     command += ["--cache", str(cache)] if cache is not None else []
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    with tempfile.TemporaryDirectory() as empty:
+        environment = os.environ | {"JAXVR_CACHE": str(empty if cache is None else cache)}
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
     if done.returncode:
         raise RuntimeError(f"{' '.join(command[1:])} failed:\n{done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])

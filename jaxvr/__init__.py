@@ -12,9 +12,11 @@ has no gradient, depths and scalars are arithmetic on local data and have one. A
 shade many, since segments do not depend on the transfer function.
 
 Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, `view`, `optics`,
-`trace`, `composite`, `adjoint`, `render`, `fit`, `plot`, `cli`.
+`trace`, `composite`, `native`, `adjoint`, `render`, `fit`, `plot`, `cli`. Those of `native` are
+compiled loops, which serve where they can with the same results.
 """
 
+from jaxvr import native
 from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay
 from jaxvr.composite import Over
@@ -65,6 +67,7 @@ __all__ = [
     "fit",
     "fit_parameters",
     "list_fields",
+    "native",
     "psnr",
     "read_mesh",
     "read_plot3d",

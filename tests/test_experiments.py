@@ -19,6 +19,7 @@ from experiments import (
     full_vs_partial,
     integrators,
     layouts,
+    limits,
     log_table,
     preintegration_build,
     quantised_table,
@@ -125,6 +126,13 @@ def speed_error(folder: Path) -> float:
     return report["runs"][0]["error"]
 
 
+def limits_cells(folder: Path) -> float:
+    """Cells on a ray through a box of 3 x 3 x 3 blocks of six."""
+    report = limits.main(["--tiny", "--json", str(folder / "limits.json")])
+    assert all(x > 0 for x in report["machine"].values())
+    return report["meshes"][0]["cells a ray"]
+
+
 EXPERIMENTS = [
     (demo_psnr, 25, 200),
     (fit_transfer_psnr, 25, 200),
@@ -136,6 +144,7 @@ EXPERIMENTS = [
     (control_points_pieces, 1.2, 10),
     (speed_error, 1e-9, 1e-6),
     (layouts_chord, 1e-9, 1e-6),
+    (limits_cells, 5, 20),
 ]
 
 

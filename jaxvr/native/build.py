@@ -43,7 +43,10 @@ class NativeError(RuntimeError):
 
 
 def compiler() -> list[str] | None:
-    """The command of a C compiler, or None."""
+    """The command of a C compiler, or None. On Windows there is none: the threads' waiting and the
+    aligned memory are POSIX."""
+    if sys.platform == "win32":
+        return None
     chosen = os.environ.get("JAXVR_CC")
     if chosen:
         return shlex.split(chosen)
