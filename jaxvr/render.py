@@ -12,7 +12,6 @@ does.
 from __future__ import annotations
 
 import math
-import numbers
 from functools import partial
 from typing import Any
 
@@ -35,8 +34,9 @@ from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
 
-# Rays of a tile, rows and columns of pixels, and so of a batch: enough to hide the cost of
-# starting a kernel, few enough that they take about as many steps and their state stays in cache.
+# Rays of a tile, rows and columns of pixels, and so of a batch in float32: enough to hide the cost of
+# starting a kernel, few enough that they take about as many steps and their state stays in cache. In
+# float64 half as many: XLA hands larger kernels to several threads, which costs more than it saves.
 TILE = (16, 32)
 BATCH = TILE[0] * TILE[1]
 # Accelerators want many more at once; not measured yet.
@@ -286,11 +286,12 @@ def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):
 
 def _batch_size(budget: Any, volume: Any) -> int:
     """Rays that march at once."""
+    itemsize = np.dtype(_dtype_of(volume)).itemsize
     if budget is None:
-        return BATCH if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
-    if not isinstance(budget, numbers.Real) or not 1 <= budget < math.inf:
+        return BATCH * 4 // itemsize if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
+    if not isinstance(budget, int | float | np.number) or not 1 <= budget < math.inf:
         raise ValueError(f"budget must be a number of bytes, at least 1, but is {budget!r}.")
-    return max(int(budget) // (NUMBERS_PER_RAY * np.dtype(_dtype_of(volume)).itemsize), 1)
+    return max(int(budget) // (NUMBERS_PER_RAY * itemsize), 1)
 
 
 def _batches(most: int, arrays: Any) -> tuple[Any, int]:

@@ -1,9 +1,10 @@
 """Where rays enter a mesh: all boundary faces that the line of a ray crosses inwards, by depth.
 
 A bounding volume hierarchy over the boundary faces, in Morton order, as a perfect binary tree in
-heap order: node i has the children 2 i and 2 i + 1, and the node to visit after a subtree is
-(i + 1) without its trailing zero bits, so a ray needs no stack. Its boxes are computed from the
-points at every call, since points may have moved.
+heap order: node i has the children 2 i and 2 i + 1. A visit looks at both of a node's children; of
+two that a ray meets, it goes to the first and sets a bit for the other, one for each level of the
+tree, so that a ray's stack is one number. Boxes are computed from the points at every call, since
+points may have moved.
 
 The search is in two phases, so that the costly exact test is not run in lock step with the cheap
 one: first boxes, until a ray has collected a few candidates, then the candidates. It keeps the
@@ -23,16 +24,17 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxvr._core.gather import load, take
 from jaxvr._core.stage import stage
-from jaxvr.trace.face import crossing, is_positive, opposite_edges, sizes_of
-from jaxvr.trace.scene import Scene, entry_corners, fetch, local_ids
+from jaxvr.trace.face import crossing, face_edges, is_positive, sizes_of
+from jaxvr.trace.scene import Scene, entry_corners, local_ids, project
 from jaxvr.trace.shear import ShearedRays
 from jaxvr.volume import packing
 
 Array = jax.Array
 
 PEEL = 4  # entries kept by one search
-BATCH = 12  # candidates collected before they are tested
+BATCH = 16  # candidates collected before they are tested
 
 
 class Entries(NamedTuple):
@@ -51,17 +53,24 @@ def no_entries(count: int, dtype: Any, more: bool = False) -> Entries:
 
 
 class Boxes(NamedTuple):
-    """Bounds of heap nodes: low and high corners (3 * 2 L,), axis by axis."""
+    """Bounds of heap nodes: low and high corners (3 * 2 L,), axis by axis.
+
+    corners (3 * 3 L,): of the vertices of each leaf's face, axis by axis, then vertex by vertex.
+    Coordinates lie apart, not in records: rays of a batch are in few nodes at a time, and those
+    share cache lines.
+    """
 
     low: Array
     high: Array
+    corners: Array
 
 
 def build_boxes(scene: Scene) -> Boxes:
     """Boxes of all nodes, leaves first and then each level from the one below."""
     count = scene.coordinates.shape[0] // 3
     used = scene.faces >= 0
-    cell, corner = packing.cell_of(scene.faces), packing.corner_of(scene.faces)
+    faces = jnp.maximum(scene.faces, 0)
+    cell, corner = packing.cell_of(faces), packing.corner_of(faces)
     ids = local_ids(scene, cell[None], entry_corners(corner))
     points = lax.stop_gradient(scene.coordinates).reshape(3, count)[:, ids]
     low = jnp.where(used[None], points.min(1), jnp.inf)
@@ -76,32 +85,52 @@ def build_boxes(scene: Scene) -> Boxes:
     return Boxes(
         jnp.concatenate([pad, *reversed(lows)], 1).reshape(-1),
         jnp.concatenate([pad, *reversed(highs)], 1).reshape(-1),
+        points.reshape(-1),
     )
 
 
-def _meets(boxes: Boxes, rays: ShearedRays, node: Array, slack: Array) -> Array:
-    """Whether the line of a ray may pass the box of a node: never a wrong no."""
+def _meet(boxes: Boxes, rays: ShearedRays, node: Array, slack: Array, wanted: Array) -> Array:
+    """Whether the line of a ray may pass the boxes of its node's children (2, R): never a wrong
+    no. wanted (): whether any ray asks."""
     count = boxes.low.shape[0] // 3
 
-    def span(axis: Array, origin: Array) -> tuple[Array, Array]:
-        at = axis * count + node
-        return boxes.low[at] - origin, boxes.high[at] - origin
+    def find(low, high, node, *axes):
+        child = 2 * node[None] + jnp.arange(2, dtype=jnp.int32)[:, None]
+        return [[take(x, count * axis[None] + child) for x in (low, high)] for axis in axes]
 
-    z_low, z_high = span(rays.axis_z, rays.origin_z)
+    axes = (rays.axis_x, rays.axis_y, rays.axis_z)
+    found = load(wanted, find, boxes.low, boxes.high, node, *axes)
 
-    def passes(axis: Array, origin: Array, shear: Array) -> Array:
-        low, high = span(axis, origin)
-        a, b = shear * z_low, shear * z_high
-        return (low - jnp.maximum(a, b) <= slack) & (high - jnp.minimum(a, b) >= -slack)
+    def meet(found, rays, slack):
+        origins = (rays.origin_x, rays.origin_y, rays.origin_z)
+        (x_low, x_high), (y_low, y_high), (z_low, z_high) = (
+            [bound - origin[None] for bound in pair]
+            for pair, origin in zip(found, origins, strict=True)
+        )
 
-    return passes(rays.axis_x, rays.origin_x, rays.shear_x) & passes(
-        rays.axis_y, rays.origin_y, rays.shear_y
-    )
+        def passes(low: Array, high: Array, shear: Array) -> Array:
+            a, b = shear[None] * z_low, shear[None] * z_high
+            nearer, farther = low - jnp.maximum(a, b), high - jnp.minimum(a, b)
+            return (nearer <= slack[None]) & (farther >= -slack[None])
+
+        return passes(x_low, x_high, rays.shear_x) & passes(y_low, y_high, rays.shear_y)
+
+    return stage(wanted, meet, found, rays, slack)
 
 
-def _collect(boxes: Boxes, rays: ShearedRays, node: Array, leaves: int):
-    """Visits nodes until every ray is through (node 0) or has BATCH candidates (BATCH, R)."""
-    rays_count = node.shape[0]
+class _Visit(NamedTuple):
+    """node (R,): an inner node whose children are next, 0 for none. pending (R,): bit k is set if
+    the sibling of the node k levels up is still to visit. candidates (BATCH, R), found (R,)."""
+
+    node: Array
+    pending: Array
+    candidates: Array
+    found: Array
+
+
+def _collect(boxes: Boxes, rays: ShearedRays, node: Array, pending: Array, leaves: int) -> _Visit:
+    """Visits nodes until every ray is through (node 0) or has candidates enough for a test."""
+    count = node.shape[0]
     eps = jnp.finfo(boxes.low.dtype).eps
     reach = jnp.maximum(jnp.max(jnp.abs(boxes.low[count_root(boxes)])), 1.0)
     far = jnp.maximum(
@@ -109,30 +138,35 @@ def _collect(boxes: Boxes, rays: ShearedRays, node: Array, leaves: int):
     )
     slack = 16 * eps * (far + reach)
 
-    def busy(carry):
-        node, _, found = carry
-        return jnp.any((node > 0) & (found < BATCH))
+    def going(visit: _Visit) -> Array:
+        return (visit.node > 0) & (visit.found < BATCH - 1)
 
-    def visit(carry):
-        node, candidates, found = carry
-        go = (node > 0) & (found < BATCH)
-        hit = go & _meets(boxes, rays, node, slack)
-        leaf = node >= leaves
-        take = hit & leaf
+    def step(visit: _Visit) -> _Visit:
+        go = going(visit)
+        node, pending, candidates, found = visit
+        left, right = 2 * node, 2 * node + 1
+        in_left, in_right = go[None] & _meet(boxes, rays, node, slack, jnp.any(go))
+        leaf = left >= leaves  # both are
         rows = jnp.arange(BATCH)[:, None]
-        candidates = jnp.where((rows == found[None]) & take[None], node[None], candidates)
-        after = node + 1
-        trailing = lax.population_count((after & -after) - 1)
-        skip = lax.shift_right_logical(after, trailing)
-        skip = jnp.where(skip == 1, 0, skip)
-        onward = jnp.where(hit & ~leaf, 2 * node, skip)
-        return jnp.where(go, onward, node), candidates, found + take.astype(jnp.int32)
+        take_left, take_right = in_left & leaf, in_right & leaf
+        second = found + take_left.astype(jnp.int32)
+        candidates = jnp.where((rows == found[None]) & take_left[None], left[None], candidates)
+        candidates = jnp.where((rows == second[None]) & take_right[None], right[None], candidates)
+        down = (in_left | in_right) & ~leaf
+        # Down to one child, the other is pending if both are met; or back to the last one pending.
+        below = pending * 2 + (in_left & in_right).astype(jnp.int32)
+        up = lax.population_count((pending & -pending) - 1)
+        back = jnp.where(pending == 0, 0, lax.shift_right_logical(node, up) ^ 1)
+        after = jnp.where(pending == 0, 0, lax.shift_right_logical(pending, up) & -2)
+        return _Visit(
+            jnp.where(go, jnp.where(down, jnp.where(in_left, left, right), back), node),
+            jnp.where(go, jnp.where(down, below, after), pending),
+            candidates,
+            second + take_right.astype(jnp.int32),
+        )
 
-    candidates = jnp.zeros((BATCH, rays_count), jnp.int32)
-    node, candidates, found = lax.while_loop(
-        busy, visit, (node, candidates, jnp.zeros(rays_count, jnp.int32))
-    )
-    return node, candidates, found
+    start = _Visit(node, pending, jnp.zeros((BATCH, count), jnp.int32), jnp.zeros_like(node))
+    return lax.while_loop(lambda visit: jnp.any(going(visit)), step, start)
 
 
 def count_root(boxes: Boxes) -> Array:
@@ -140,16 +174,25 @@ def count_root(boxes: Boxes) -> Array:
     return jnp.arange(3) * (boxes.low.shape[0] // 3) + 1
 
 
-def _test(scene: Scene, rays: ShearedRays, word: Array, valid: Array):
-    """Whether a ray's line crosses a boundary face inwards, and at which depth."""
-    cell, corner = packing.cell_of(word), packing.corner_of(word)
+def _test(boxes: Boxes, rays: ShearedRays, leaf: Array, inwards: Array, valid: Array):
+    """Whether a ray's line crosses the face of a leaf (R,) inwards, and at which depth."""
     wanted = jnp.any(valid)
-    a, b, c = fetch(scene, rays, cell, entry_corners(corner), wanted)
-    edges = stage(wanted, opposite_edges, a, b, c)
-    inwards = packing.flag_of(word) == 1
-    contained = jnp.all(is_positive(edges) == inwards[None], 0)
-    crossed = stage(wanted, lambda *x: crossing(x[:3], sizes_of(x[3])), a, b, c, edges)
-    return contained, crossed.z
+
+    def find(corners, rays, leaf):
+        count = corners.shape[0] // 9
+        places = [3 * count * axis + leaf for axis in (rays.axis_x, rays.axis_y, rays.axis_z)]
+        return [[take(corners, at + count * k) for at in places] for k in range(3)]
+
+    none = jnp.zeros_like(rays.origin_z)  # entries need no scalar
+    found = load(wanted, find, boxes.corners, rays, leaf)
+    face = tuple(project(rays, (*vertex, none), wanted) for vertex in found)
+    edges = stage(wanted, face_edges, *face)
+    a, b, c = (is_positive(edge) == inwards for edge in edges)
+
+    def depth_of(face, edges, eye):
+        return crossing(face, jnp.stack([sizes_of(edge) for edge in edges]), eye).z
+
+    return a & b & c, stage(wanted, depth_of, face, edges, rays.eye)
 
 
 def search(
@@ -186,25 +229,24 @@ def search(
         return Entries(tuple(new_depths), tuple(new_faces), more | valid)
 
     def round_(carry):
-        node, entries = carry
-        node, candidates, found = _collect(boxes, rays, node, leaves)
+        node, pending, entries = carry
+        node, pending, candidates, found = _collect(boxes, rays, node, pending, leaves)
 
         def one(k, entries):
-            leaf = candidates[k]
-            word = scene.faces[jnp.maximum(leaf - leaves, 0)]
+            leaf = jnp.maximum(candidates[k] - leaves, 0)
+            word = take(scene.faces, leaf)
             valid = (k < found) & (word >= 0)
-            word = jnp.maximum(word, 0)
-            contained, depth = _test(scene, rays, word, valid)
+            inwards = packing.flag_of(word) == 1
+            contained, depth = _test(boxes, rays, leaf, inwards, valid)
             behind = (depth > last_depth) | ((depth == last_depth) & (word > last_face))
             valid = valid & contained & behind
             return lax.cond(jnp.any(valid), insert, lambda e, *_: e, entries, depth, word, valid)
 
-        return node, lax.fori_loop(0, jnp.max(found), one, entries)
+        return node, pending, lax.fori_loop(0, jnp.max(found), one, entries)
 
     entries = no_entries(count, dtype)
-    _, entries = lax.while_loop(
-        lambda carry: jnp.any(carry[0] > 0),
-        round_,
-        (jnp.where(wanted, 1, 0).astype(jnp.int32), entries),
+    node = jnp.where(wanted, 1, 0).astype(jnp.int32)
+    *_, entries = lax.while_loop(
+        lambda carry: jnp.any(carry[0] > 0), round_, (node, jnp.zeros_like(node), entries)
     )
     return entries

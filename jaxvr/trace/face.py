@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxvr._core.once import once
 from jaxvr.numerics.exact import edge_side, halves, two_sum
-from jaxvr.trace.shear import VALUE, Z_LOW, X, Y, Z
+from jaxvr.trace.shear import VALUE, X, Y, Z
 
 Array = jax.Array
 Face = tuple[Array, Array, Array]
@@ -32,7 +33,7 @@ def choose(mask: Array, yes: Any, no: Any) -> Any:
 
 
 class Crossing(NamedTuple):
-    """A point of the ray: depth z + z_low and scalar, (R,) each."""
+    """A point of the ray: depth z + z_low from the eye, and scalar, (R,) each."""
 
     z: Array
     z_low: Array
@@ -53,11 +54,11 @@ def _area_jvp(primals, tangents) -> Any:
     return (area, positive), (change, np.zeros(positive.shape, jax.dtypes.float0))
 
 
-def edges(i: Array, j: Array, i_first: Array) -> Array:
+def edges(i: Array, j: Array, i_first: Array | bool) -> Array:
     """Twice the area of (origin, i, j) for pairs of vertices; right in sign even if zero.
 
-    i, j (2, E, R): projected coordinates. i_first (E, R): whether i comes before j in the mesh's
-    order. Returns (E, R); zeros are signed, see `is_positive`.
+    i, j (2, ..., R): projected coordinates. i_first (..., R): whether i comes before j in the
+    mesh's order. Returns (..., R); zeros are signed, see `is_positive`.
     """
     area, positive = _area(*i, *j, jnp.broadcast_to(i_first, i.shape[1:]))
     # The area has the right sign already unless it is zero.
@@ -74,14 +75,19 @@ def sizes_of(area: Array) -> Array:
     return jnp.where(is_positive(area), area, -area)
 
 
-def opposite_edges(a: Array, b: Array, c: Array) -> Array:
-    """The edges (b, c), (c, a), (a, b) of a face (3, R), vertices in the mesh's order.
+def face_edges(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
+    """The edges (b, c), (c, a), (a, b) of a face, (R,) each, vertices in the mesh's order.
 
     The ray passes inside if their signs agree; then their sizes are the barycentric weights of
     a, b and c, unnormalised.
     """
-    start, end = (jnp.stack([v[: Y + 1] for v in face], 1) for face in ((b, c, a), (c, a, b)))
-    return edges(start, end, jnp.array([[True], [False], [True]]))
+    a, b, c = (v[: Y + 1] for v in (a, b, c))
+    return edges(b, c, True), edges(c, a, False), edges(a, b, True)
+
+
+def opposite_edges(a: Array, b: Array, c: Array) -> Array:
+    """`face_edges` as one array (3, R)."""
+    return jnp.stack(face_edges(a, b, c))
 
 
 def _on_edge(face: Face) -> Array:
@@ -109,30 +115,35 @@ def barycentric(face: Face, weights: Array) -> Array:
 
     Derivative zero where the ray lies in the face's plane.
     """
-    flat = jnp.sum(weights, 0) == 0
-
-    def replaced(face, weights):
-        return jnp.where(flat[None], _on_edge(face), weights)
-
-    weights = lax.cond(jnp.any(flat), replaced, lambda _, w: w, face, weights)
-    return weights / jnp.sum(weights, 0)[None]
+    total = sum_of(weights)
+    shares = weights / jnp.where(total == 0, 1, total)[None]
+    return once(jnp.any(total == 0), _in_plane, shares, face, total)
 
 
-def crossing(face: Face, weights: Array) -> Crossing:
-    """The point of the ray in a face, from weights >= 0 (3, R)."""
-    return crossing_at(face, barycentric(face, weights))
+def sum_of(three: Array) -> Array:
+    a, b, c = three
+    return a + b + c
 
 
-def crossing_at(face: Face, coordinates: Array) -> Crossing:
+def _in_plane(shares: Array, face: Face, total: Array) -> Array:
+    weights = _on_edge(face)
+    return jnp.where((total == 0)[None], weights / sum_of(weights)[None], shares)
+
+
+def crossing(face: Face, weights: Array, eye: Array) -> Crossing:
+    """The point of the ray in a face, from weights >= 0 (3, R); eye (R,): `ShearedRays.eye`."""
+    return crossing_at(face, barycentric(face, weights), eye)
+
+
+def crossing_at(face: Face, coordinates: Array, eye: Array) -> Crossing:
     """The point of a face with these barycentric coordinates (3, R).
 
     Differences are formed first, so that constants stay constant.
     """
     a, b, c = face
     _, of_b, of_c = coordinates
-    z_step = of_b * ((b[Z] - a[Z]) + (b[Z_LOW] - a[Z_LOW]))
-    z_step = z_step + of_c * ((c[Z] - a[Z]) + (c[Z_LOW] - a[Z_LOW]))
-    z, lost = two_sum(a[Z], z_step)
-    z, z_low = two_sum(z, lost + a[Z_LOW])
+    a_z, a_low = two_sum(a[Z], -eye)
+    z, lost = two_sum(a_z, of_b * (b[Z] - a[Z]) + of_c * (c[Z] - a[Z]))
+    z, z_low = two_sum(z, lost + a_low)
     value = a[VALUE] + (of_b * (b[VALUE] - a[VALUE]) + of_c * (c[VALUE] - a[VALUE]))
     return Crossing(z, z_low, value)

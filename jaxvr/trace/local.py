@@ -40,9 +40,10 @@ from jaxvr.trace.face import (
     edges,
     is_positive,
     sizes_of,
+    sum_of,
 )
-from jaxvr.trace.scene import Scene, entry_corners, local_ids, value_slots
-from jaxvr.trace.shear import VALUE, Z_LOW, ShearedRays, X, Y, Z
+from jaxvr.trace.scene import Scene, points_at, value_slots
+from jaxvr.trace.shear import VALUE, ShearedRays, X, Y, Z
 from jaxvr.volume import packing
 
 Array = jax.Array
@@ -56,16 +57,15 @@ class Exit(NamedTuple):
     lost: Array
 
 
-def leave_by(positive: Array, weights: Array, to_apex: Array) -> Exit:
-    """Which face a ray leaves by, from the edges (3, R) that join a, b and c to the apex."""
-    side = is_positive(to_apex) == positive[None]
-    to_a, to_b, to_c = side
+def leave_by(positive: Array, weights: Array, to_apex: tuple[Array, Array, Array]) -> Exit:
+    """Which face a ray leaves by, from the edges (R,) that join a, b and c to the apex."""
+    to_a, to_b, to_c = (is_positive(edge) == positive for edge in to_apex)
     drop = jnp.where(to_c & ~to_b, 0, jnp.where(to_a & ~to_c, 1, 2)).astype(jnp.int32)
     lost = (to_a == to_b) & (to_b == to_c)
-    return Exit(drop, exit_sizes(weights, sizes_of(to_apex), drop), lost)
+    return Exit(drop, exit_sizes(weights, tuple(map(sizes_of, to_apex)), drop), lost)
 
 
-def exit_sizes(weights: Array, to_apex: Array, drop: Array) -> Array:
+def exit_sizes(weights: Array, to_apex: tuple[Array, ...], drop: Array) -> Array:
     """Barycentric weights (3, R) of the exit face, from sizes of edges.
 
     The weight of a vertex is the area across from it: with d in place of the dropped vertex, the
@@ -76,17 +76,24 @@ def exit_sizes(weights: Array, to_apex: Array, drop: Array) -> Array:
     return jnp.stack([jnp.where(drop == 2, w_b, w_c), jnp.where(drop == 0, w_b, w_a), kept])
 
 
-def edges_to_apex(face: Face, apex: Array, corner: Array) -> Array:
-    """The edges (a, d), (b, d), (c, d), (3, R); the apex stands at `corner` in the order."""
-    start = jnp.stack([v[: Y + 1] for v in face], 1)
-    end = jnp.broadcast_to(apex[: Y + 1, None], start.shape)
-    return edges(start, end, corner[None] > jnp.arange(3)[:, None])
+def edges_to_apex(face: Face, apex: Array, corner: Array) -> tuple[Array, Array, Array]:
+    """The edges (a, d), (b, d), (c, d), (R,) each; the apex stands at `corner` in the order."""
+    d = apex[: Y + 1]
+    a, b, c = (edges(v[: Y + 1], d, corner > k) for k, v in enumerate(face))
+    return a, b, c
 
 
 def exit_face(face: Face, apex: Array, drop: Array) -> Face:
     """The vertices of the exit face: two of the entry face, in order, and the apex."""
     a, b, c = face
     return choose(drop == 0, b, a), choose(drop == 2, b, c), apex
+
+
+def in_order(three: Any, place: Array) -> Any:
+    """(p, q, d) with d at `place` (0, 1, 2), where it stands in the mesh's order."""
+    p, q, d = three
+    front, back = place == 0, place == 2
+    return choose(front, d, p), choose(front, p, choose(back, q, d)), choose(back, d, q)
 
 
 def make_segment(depth, front: Array, out, turned: Array, stretch: Array):
@@ -132,19 +139,28 @@ def _pull_back_crossing(face: Face, area: Array, z_bar: Array, s_bar: Array) -> 
     u_x, u_y, v_x, v_y = b[X] - a[X], b[Y] - a[Y], c[X] - a[X], c[Y] - a[Y]
     per_area = jnp.where(area == 0, 0, 1 / jnp.where(area == 0, 1, area))
 
-    def along(row: int, low: int | None = None) -> tuple[Array, Array]:
+    def along(row: int) -> tuple[Array, Array]:
         to_b, to_c = b[row] - a[row], c[row] - a[row]
-        if low is not None:
-            to_b, to_c = to_b + (b[low] - a[low]), to_c + (c[low] - a[low])
         return (to_b * v_y - to_c * u_y) * per_area, (u_x * to_c - v_x * to_b) * per_area
 
-    (z_x, z_y), (s_x, s_y) = along(Z, Z_LOW), along(VALUE)
+    (z_x, z_y), (s_x, s_y) = along(Z), along(VALUE)
     return _Pulled(-(z_bar * z_x + s_bar * s_x), -(z_bar * z_y + s_bar * s_y), z_bar, s_bar)
 
 
-def _crossed(face: Face, weights: Array) -> tuple[Array, Crossing]:
+def _crossed(face: Face, weights: Array, eye: Array) -> tuple[Array, Crossing]:
     coordinates = barycentric(face, weights)
-    return coordinates, crossing_at(face, coordinates)
+    return coordinates, crossing_at(face, coordinates, eye)
+
+
+def _by_corner(share: Array, corner: Array) -> tuple[Array, ...]:
+    """Shares (3, R) of a face's vertices as those of the cell's four, 0 for the one at `corner`."""
+    a, b, c = share
+    return (
+        jnp.where(corner == 0, 0, a),
+        jnp.where(corner == 1, 0, jnp.where(corner < 1, a, b)),
+        jnp.where(corner == 2, 0, jnp.where(corner < 2, b, c)),
+        jnp.where(corner == 3, 0, c),
+    )
 
 
 def pull_back_cell(
@@ -152,13 +168,12 @@ def pull_back_cell(
 ) -> Any:
     """See `AbstractTracer.pull_back`; `gradient` is ((values, coordinates), rays), or Nones."""
     (values, coordinates), by_rays = gradient
-    cell = state.cell
+    cell, ahead = state.cell, state.ahead
     live, wanted = state.active, jnp.any(state.active)
     number, corner = packing.cell_of(cell.word), packing.corner_of(cell.word)
     turned = packing.turned_of(cell.word) == 1
-    face, leaving = cell.face, exit_face(cell.face, cell.apex, cell.drop)
-    share, enter = stage(wanted, _crossed, face, cell.weights)
-    exit_share, leave = stage(wanted, _crossed, leaving, cell.exit_weights)
+    share, enter = stage(wanted, _crossed, cell.face, cell.weights, rays.eye)
+    exit_share, leave = stage(wanted, _crossed, ahead.face, ahead.weights, rays.eye)
 
     def pull_back_segment(enter: Crossing, leave: Crossing, stretch: Array, bar: Segment):
         def forward(enter, leave, stretch):
@@ -171,25 +186,17 @@ def pull_back_cell(
     enter_bar, leave_bar, stretch_bar = stage(
         wanted, pull_back_segment, enter, leave, rays.stretch, cotangent
     )
-    # The face (first, second, apex) is positive like the entry face, but for the dropped middle.
-    flip = cell.positive ^ (cell.drop == 1)
-    area, exit_area = jnp.sum(cell.weights, 0), jnp.sum(cell.exit_weights, 0)
-    area, exit_area = jnp.where(cell.positive, area, -area), jnp.where(flip, exit_area, -exit_area)
-    q = stage(wanted, _pull_back_crossing, face, area, enter_bar.z, enter_bar.value)
-    p = stage(wanted, _pull_back_crossing, leaving, exit_area, leave_bar.z, leave_bar.value)
+    area, exit_area = sum_of(cell.weights), sum_of(ahead.weights)
+    area = jnp.where(cell.positive, area, -area)
+    exit_area = jnp.where(ahead.positive, exit_area, -exit_area)
+    q = stage(wanted, _pull_back_crossing, cell.face, area, enter_bar.z, enter_bar.value)
+    p = stage(wanted, _pull_back_crossing, ahead.face, exit_area, leave_bar.z, leave_bar.value)
 
-    # Shares of a, b, c and d in both crossings.
-    none = jnp.zeros_like(share[0])
-    first, second, apex = exit_share
-    exit_share = (
-        jnp.where(cell.drop == 0, none, first),
-        jnp.where(cell.drop == 0, first, jnp.where(cell.drop == 2, second, none)),
-        jnp.where(cell.drop == 2, none, second),
-        apex,
+    shares = list(
+        zip(_by_corner(share, corner), _by_corner(exit_share, cell.exit_corner), strict=True)
     )
-    shares = list(zip((*share, none), exit_share, strict=True))
-    corners = jnp.concatenate([entry_corners(corner), corner[None]])
-    ids = stage(wanted, local_ids, scene, number[None], corners)
+    corners = jnp.broadcast_to(jnp.arange(4, dtype=jnp.int32)[:, None], (4, *number.shape))
+    ids = points_at(scene, number, corners, wanted)
     if values is not None:
         slots = value_slots(scene, number[None], corners, ids)
         bars = [i * q.s + o * p.s for i, o in shares]

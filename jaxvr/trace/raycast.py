@@ -31,24 +31,31 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from jaxvr._core import status as bits
+from jaxvr._core.gather import load, take
+from jaxvr._core.once import once
 from jaxvr._core.pytree import pytree
 from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment
 from jaxvr.trace.base import AbstractTracer
 from jaxvr.trace.entry import Boxes, Entries, build_boxes, no_entries, search
 from jaxvr.trace.face import Face, choose, crossing, is_positive, opposite_edges, sizes_of
-from jaxvr.trace.local import edges_to_apex, exit_face, leave_by, make_segment, pull_back_cell
+from jaxvr.trace.local import (
+    edges_to_apex,
+    exit_face,
+    in_order,
+    leave_by,
+    make_segment,
+    pull_back_cell,
+)
 from jaxvr.trace.scene import (
     Scene,
     entry_corners,
     fetch,
-    local_ids,
     longest_edge,
     make_scene,
-    value_slots,
+    values_at,
 )
 from jaxvr.trace.shear import VALUE, ShearedRays, shear_rays
 from jaxvr.volume import packing
@@ -66,39 +73,27 @@ class CastScene:
 
 
 class Cell(NamedTuple):
-    """The cell that a ray is in, with the two faces that it crosses.
+    """The cell that a ray is in, with the face that it came in by.
 
     word (R,): packed cell and local index of the apex. positive (R,): sign of the entry face.
-    face: three vertices (5, R) of the entry face. weights (3, R): their barycentric weights.
-    apex (5, R): the fourth vertex. drop (R,): which vertex (0, 1, 2) of the entry face the exit
-    face does not have. exit_weights (3, R): of the two others, in order, and of the apex.
+    face: its three vertices (4, R). weights (3, R): their barycentric weights. exit_corner (R,):
+    local index of the vertex that the exit face does not have.
     """
 
     word: Array
     positive: Array
     face: Face
     weights: Array
-    apex: Array
-    drop: Array
-    exit_weights: Array
+    exit_corner: Array
 
 
-class CastState(NamedTuple):
-    """One state of R rays; `depth` (2, R), a pair, is where the current segment ends."""
+class Ahead(NamedTuple):
+    """The face that a ray crosses next: the exit of the cell that it is in, or an entry.
 
-    cell: Cell
-    depth: Array
-    segment: Segment
-    active: Array
-    waiting: Array
-    fresh: Array
-    status: Array
-    entries: Entries
-    last: tuple[Array, Array]
-
-
-class _Arrival(NamedTuple):
-    """A cell about to be entered: through which face, with which sign, at which depth."""
+    word (R,): packed cell behind it and local index of the apex there, -1 outside of the mesh.
+    positive (R,), face, weights (3, R): its sign, vertices and weights, as in a `Cell`.
+    depth (2, R), a pair, and value (R,): where the ray crosses it.
+    """
 
     word: Array
     positive: Array
@@ -106,6 +101,21 @@ class _Arrival(NamedTuple):
     weights: Array
     depth: Array
     value: Array
+
+
+class CastState(NamedTuple):
+    """One state of R rays. Only `pull_back` reads `cell`: loops without it do not carry it, since
+    XLA drops what nothing depends on."""
+
+    cell: Cell
+    ahead: Ahead
+    segment: Segment
+    active: Array
+    waiting: Array
+    fresh: Array
+    status: Array
+    entries: Entries
+    last: tuple[Array, Array]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,12 +143,11 @@ class RayCast(AbstractTracer):
         count = rays.origin_x.shape[0]
         zero, no = jnp.zeros(count, dtype), jnp.zeros(count, bool)
         integer = jnp.zeros(count, jnp.int32)
-        vertex = jnp.zeros((5, count), dtype)
-        ones = jnp.ones((3, count), dtype)
-        cell = Cell(integer, no, (vertex, vertex, vertex), ones, vertex, integer, ones)
+        vertex = jnp.zeros((4, count), dtype)
+        face, ones = (vertex, vertex, vertex), jnp.ones((3, count), dtype)
         return CastState(
-            cell=cell,
-            depth=jnp.zeros((2, count), dtype),
+            cell=Cell(integer, no, face, ones, integer),
+            ahead=Ahead(integer, no, face, ones, jnp.zeros((2, count), dtype), zero),
             segment=Segment(zero, zero, zero),
             active=no,
             waiting=~no,
@@ -151,23 +160,19 @@ class RayCast(AbstractTracer):
     def step(self, scene: CastScene, rays: ShearedRays, state: CastState, move: Array) -> CastState:
         with jax.named_scope("raycast_step"):
             move = move & state.active
-            arrival = _leave(scene.mesh, state)
-            inside = move & (arrival.word >= 0)
+            inside = move & (state.ahead.word >= 0)
             gone = move & ~inside
             # A ray that waits for nothing is done.
             left = (state.entries.face[0] >= 0) | state.entries.more
-            state = state._replace(
-                active=state.active & ~gone, waiting=state.waiting | (gone & left)
-            )
+            active, waiting = state.active & ~gone, state.waiting | (gone & left)
             # Entering is rare and costly, so it waits until no ray of the batch is inside.
-            arrival, state, entering = lax.cond(
-                jnp.any(state.active),
-                lambda s, a: (a, s, jnp.zeros_like(move)),
-                lambda s, a: _enter(scene, rays, s, a),
-                state,
-                arrival,
+            enter = ~jnp.any(active)
+            door = _Door(state.ahead, inside, waiting, state.entries, state.last)
+            ahead, moved, waiting, entries, last = once(enter, _enter, door, scene, rays)
+            state = state._replace(
+                ahead=ahead, active=active, waiting=waiting, entries=entries, last=last
             )
-            return _arrive(scene.mesh, rays, state, arrival, inside | entering, entering)
+            return _cross(scene.mesh, rays, state, moved, enter)
 
     def gradient_start(self, scene, rays, perturbed):
         mesh, by_rays = perturbed[0].mesh, any(jax.tree.leaves(perturbed[1]))
@@ -206,48 +211,29 @@ class RayCast(AbstractTracer):
         )
 
 
-def _leave(scene: Scene, state: CastState) -> _Arrival:
-    """Through the exit face into the neighbour: only names and selections, one gather."""
-    cell = state.cell
-    a, b, c = cell.face
-    corner, drop = packing.corner_of(cell.word), cell.drop
-    exit_corner = drop + (corner <= drop).astype(jnp.int32)
-    word = scene.neighbors[4 * packing.cell_of(cell.word) + exit_corner]
-    # The boundary of a tetrahedron has degree zero: omitting the k-th of its sorted vertices
-    # gives a face of sign (-1)^k, and what comes in must go out.
-    positive = cell.positive ^ (((corner + exit_corner) & 1) == 0)
-    # How many of the two vertices that stay come before the apex in the mesh's order.
-    place = corner - (corner > drop).astype(jnp.int32)
-    front, back = place == 0, place == 2
+class _Door(NamedTuple):
+    """What rays that enter change."""
 
-    def insert(p, q, d):
-        return (
-            choose(front, d, p),
-            choose(front, p, choose(back, q, d)),
-            choose(back, d, q),
-        )
-
-    face = insert(choose(drop == 0, b, a), choose(drop == 2, b, c), cell.apex)
-    weights = jnp.stack(insert(*cell.exit_weights))
-    return _Arrival(word, positive, face, weights, state.depth, state.segment.back)
+    ahead: Ahead
+    moved: Array
+    waiting: Array
+    entries: Entries
+    last: tuple[Array, Array]
 
 
-def _enter(scene: CastScene, rays: ShearedRays, state: CastState, arrival: _Arrival):
+def _enter(door: _Door, scene: CastScene, rays: ShearedRays) -> _Door:
     """Waiting rays go to their next entry, if there is one."""
     mesh = scene.mesh
-    exhausted = state.waiting & (state.entries.face[0] < 0) & state.entries.more
-
-    def again(entries):
-        return choose(exhausted, search(mesh, rays, scene.boxes, exhausted, state.last), entries)
-
-    entries = lax.cond(jnp.any(exhausted), again, lambda e: e, state.entries)
-    word = entries.face[0]
-    entering = state.waiting & (word >= 0)
-    last = (
-        jnp.where(entering, entries.depth[0], state.last[0]),
-        jnp.where(entering, word, state.last[1]),
+    exhausted = door.waiting & (door.entries.face[0] < 0) & door.entries.more
+    entries = once(
+        jnp.any(exhausted), _again, door.entries, mesh, rays, scene.boxes, exhausted, door.last
     )
-
+    word = entries.face[0]
+    entering = door.waiting & (word >= 0)
+    last = (
+        jnp.where(entering, entries.depth[0], door.last[0]),
+        jnp.where(entering, word, door.last[1]),
+    )
     rest = Entries(
         (*entries.depth[1:], jnp.full_like(entries.depth[0], jnp.inf)),
         (*entries.face[1:], jnp.full_like(entries.face[0], -1)),
@@ -261,78 +247,95 @@ def _enter(scene: CastScene, rays: ShearedRays, state: CastState, arrival: _Arri
     face = (a, b, c)
     edges = stage(wanted, opposite_edges, *face)
     sizes = sizes_of(edges)
-    at = stage(wanted, crossing, face, sizes)
+    at = stage(wanted, crossing, face, sizes, rays.eye)
     word = packing.pack(cell, corner, packing.turned_of(word))
-    new = _Arrival(word, is_positive(edges[2]), face, sizes, jnp.stack(at[:2]), at.value)
-    state = state._replace(
-        waiting=entering,
-        entries=entries,
-        last=last,
-    )
-    return choose(entering, new, arrival), state, entering
+    new = Ahead(word, is_positive(edges[2]), face, sizes, jnp.stack(at[:2]), at.value)
+    ahead = choose(entering, new, door.ahead)
+    return _Door(ahead, entering, jnp.zeros_like(entering), entries, last)
 
 
-def _arrive(
-    scene: Scene,
-    rays: ShearedRays,
-    state: CastState,
-    arrival: _Arrival,
-    moved: Array,
-    entering: Array,
+def _again(entries: Entries, mesh, rays, boxes, exhausted, last) -> Entries:
+    return choose(exhausted, search(mesh, rays, boxes, exhausted, last), entries)
+
+
+def _cross(
+    scene: Scene, rays: ShearedRays, state: CastState, moved: Array, entered: Array
 ) -> CastState:
-    """Fetches the fourth vertex of the new cell, finds the exit, and makes the segment."""
-    wanted = jnp.any(moved)
-    word = jnp.maximum(arrival.word, 0)
+    """Through the face ahead: fetches the fourth vertex of the cell behind it, finds the exit, and
+    makes the segment. The exit face is the one ahead then."""
+    # What stays as it is passes through the stages too, so they are skipped only where none has.
+    ahead, wanted = state.ahead, jnp.any(moved | state.active)
+    word = jnp.maximum(ahead.word, 0)
     number, corner = packing.cell_of(word), packing.corner_of(word)
     (apex,) = fetch(scene, rays, number, corner[None], wanted)
-    face, front, fresh = _values_here(scene, arrival, number, corner, word, moved)
+    face, front, fresh = _values_here(scene, ahead, rays, number, corner, word, moved, wanted)
     to_apex = stage(wanted, edges_to_apex, face, apex, corner)
-    leave = stage(wanted, leave_by, arrival.positive, arrival.weights, to_apex)
+    leave = stage(wanted, leave_by, ahead.positive, ahead.weights, to_apex)
+    drop = leave.drop
+    exit_corner = drop + (corner <= drop).astype(jnp.int32)
+    # How many of the two vertices that stay come before the apex in the mesh's order.
+    place = corner - (corner > drop).astype(jnp.int32)
+    # The boundary of a tetrahedron has degree zero: omitting the k-th of its sorted vertices
+    # gives a face of sign (-1)^k, and what comes in must go out.
+    positive = ahead.positive ^ (((corner + exit_corner) & 1) == 0) & moved
 
-    def cross(face, apex, leave):
-        return crossing(exit_face(face, apex, leave.drop), leave.weights)
+    def look(neighbors, number, exit_corner):
+        return take(neighbors, 4 * number + exit_corner)
 
-    out = stage(wanted, cross, face, apex, leave)
+    behind = load(wanted, look, scene.neighbors, number, exit_corner)
+
+    def onward(face, apex, weights, exit_weights, drop, place, moved):
+        new = in_order(exit_face(face, apex, drop), place)
+        exit_weights = jnp.stack(in_order(exit_weights, place))
+        return choose(moved, new, face), choose(moved, exit_weights, weights)
+
+    new_face, new_weights = stage(
+        wanted, onward, face, apex, ahead.weights, leave.weights, drop, place, moved
+    )
+    out = stage(wanted, crossing, new_face, new_weights, rays.eye)
     turned = packing.turned_of(word) == 1
-    segment, depth = stage(wanted, make_segment, arrival.depth, front, out, turned, rays.stretch)
+    segment, depth = stage(wanted, make_segment, ahead.depth, front, out, turned, rays.stretch)
     lost = moved & leave.lost
-    cell = Cell(word, arrival.positive, face, arrival.weights, apex, leave.drop, leave.weights)
+    cell = Cell(word, ahead.positive, face, ahead.weights, exit_corner)
     active = jnp.where(moved, ~lost, state.active)
     segment = choose(moved, segment, state.segment)
     return CastState(
         cell=choose(moved, cell, state.cell),
-        depth=choose(moved, depth, state.depth),
+        ahead=Ahead(
+            jnp.where(moved, behind, ahead.word),
+            positive,
+            new_face,
+            new_weights,
+            choose(moved, depth, ahead.depth),
+            jnp.where(moved, segment.back, ahead.value),
+        ),
         segment=segment._replace(length=jnp.where(active, segment.length, 0)),
         active=active,
-        waiting=state.waiting & ~entering,
-        fresh=moved & (fresh | entering | (segment.front != front)),
+        waiting=state.waiting,
+        fresh=moved & (fresh | entered | (segment.front != front)),
         status=state.status | jnp.where(lost, bits.LOST, 0).astype(jnp.int32),
         entries=state.entries,
         last=state.last,
     )
 
 
-def _values_here(scene: Scene, arrival: _Arrival, number, corner, word, moved):
+def _values_here(scene: Scene, ahead: Ahead, rays, number, corner, word, moved, wanted):
     """The entry face with this cell's own scalars, the scalar at the entry, and whether it may
     differ from the one behind the face."""
-
-    def own(face, weights):
-        out = []
-        for vertex, k in zip(face, entry_corners(corner), strict=True):
-            slot = value_slots(scene, number, k, local_ids(scene, number, k))
-            out.append(vertex.at[VALUE].set(scene.values[slot]))
-        return tuple(out), crossing(tuple(out), weights).value
-
+    same, own = (ahead.face, ahead.value), (scene, rays, ahead.weights, number, corner)
     if not scene.continuous:
-        face, front = stage(jnp.any(moved), own, arrival.face, arrival.weights)
-        return face, front, jnp.ones_like(moved)
+        return *_own_values(same, *own, moved, wanted), jnp.ones_like(moved)
     if not scene.seams:
-        return arrival.face, arrival.value, jnp.zeros_like(moved)
+        return *same, jnp.zeros_like(moved)
     seam = moved & (packing.flag_of(word) == 1)
+    return *once(jnp.any(seam), _own_values, same, *own, seam, wanted), seam
 
-    def reload(face, value):
-        new, front = own(face, arrival.weights)
-        return choose(seam, new, face), jnp.where(seam, front, value)
 
-    face, front = lax.cond(jnp.any(seam), reload, lambda *same: same, arrival.face, arrival.value)
-    return face, front, seam
+def _own_values(same, scene: Scene, rays, weights, number, corner, where, wanted):
+    """The entry face and the scalar there, `same`, with a cell's own scalars for rays `where`."""
+    face, front = same
+    values = values_at(scene, number, entry_corners(corner), wanted)
+    own = tuple(v.at[VALUE].set(value) for v, value in zip(face, values, strict=True))
+    face = choose(where, own, face)
+    at = stage(wanted, crossing, face, weights, rays.eye)
+    return face, jnp.where(where, at.value, front)

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxvr._core.gather import load, take
 from jaxvr._core.pytree import pytree, static
 from jaxvr._core.stage import stage
 from jaxvr.trace.shear import ShearedRays, shear_points
@@ -29,12 +30,15 @@ class Scene:
     """A mesh of P points, T cells and F boundary faces.
 
     coordinates (3 P,): all x, all y, all z, times `scale` ().
+    vertices (4 P,): x, y, z of each point and its scalar, 0 if values do not live at points; the
+    same numbers as in `coordinates` and `values`, so that a vertex is in one cache line.
     values (V,): as in the mesh, flat. cells (4 T,), neighbors (4 T,): flat, see `TetMesh`.
     faces (L,): `TetMesh.boundary` padded by -1 to a power of two.
     location: where the values live. seams: whether some points coincide.
     """
 
     coordinates: Array
+    vertices: Array
     values: Array
     cells: Array
     neighbors: Array
@@ -57,8 +61,12 @@ def make_scene(mesh: TetMesh) -> Scene:
     count = mesh.boundary.shape[0]
     leaves = 1 << max(count - 1, 1).bit_length()
     faces = jnp.concatenate([mesh.boundary, jnp.full(leaves - count, -1, jnp.int32)])
+    points = points * scale
+    at_points = mesh.location == "point"
+    values = mesh.values if at_points else jnp.zeros_like(points[:, 0])
     return Scene(
-        coordinates=(points * scale).T.reshape(-1),
+        coordinates=points.T.reshape(-1),
+        vertices=jnp.concatenate([points, values[:, None]], 1).reshape(-1),
         values=mesh.values.reshape(-1),
         cells=mesh.cells.reshape(-1),
         neighbors=mesh.neighbors.reshape(-1),
@@ -98,7 +106,7 @@ def longest_edge(scene: Scene) -> Array:
 
 def local_ids(scene: Scene, cell: Array, corner: Array) -> Array:
     """Point id at a local corner (R,) of a cell (R,)."""
-    return scene.cells[4 * cell + corner]
+    return take(scene.cells, 4 * cell + corner)
 
 
 def value_slots(scene: Scene, cell: Array, corner: Array, point: Array) -> Array:
@@ -108,27 +116,53 @@ def value_slots(scene: Scene, cell: Array, corner: Array, point: Array) -> Array
     return cell + 0 * corner if scene.location == "cell" else 4 * cell + corner
 
 
+def points_at(scene: Scene, cell: Array, corners: Array, wanted: Array) -> Array:
+    """Point ids at local corners (C, R) of cells (R,)."""
+
+    def find(cells, cell, corners):
+        return take(cells, 4 * cell[None] + corners)
+
+    return load(wanted, find, scene.cells, cell, corners)
+
+
+def values_at(scene: Scene, cell: Array, corners: Array, wanted: Array) -> Array:
+    """Scalars that cells (R,) have at local corners (C, R)."""
+    at_points = scene.location == "point"
+    point = points_at(scene, cell, corners, wanted) if at_points else corners
+
+    def find(values, cell, corners, point):
+        return take(values, value_slots(scene, cell[None], corners, point))
+
+    return load(wanted, find, scene.values, cell, corners, point)
+
+
 def fetch(
     scene: Scene, rays: ShearedRays, cell: Array, corners: Array, wanted: Array
 ) -> tuple[Array, ...]:
-    """The vertices (5, R) at local corners (C, R) of a cell (R,), as each ray sees them.
+    """The vertices (4, R) at local corners (C, R) of a cell (R,), as each ray sees them.
 
     wanted (): whether any ray needs them.
     """
-    count = scene.coordinates.shape[0] // 3
 
-    def load(scene, rays, cell, corners):
-        point = local_ids(scene, cell[None], corners)
-        axes = (rays.axis_x, rays.axis_y, rays.axis_z)
-        at = [scene.coordinates[axis[None] * count + point] for axis in axes]
-        return *at, scene.values[value_slots(scene, cell[None], corners, point)]
+    def find(vertices, rays, point):
+        rows = jnp.stack([rays.axis_x, rays.axis_y, rays.axis_z, jnp.full_like(rays.axis_x, 3)])
+        return take(vertices, rows[:, None] + 4 * point[None])
 
-    def project(rays, *point):
-        return shear_points(jax.tree.map(lambda x: x[None], rays), *point)
+    point = points_at(scene, cell, corners, wanted)
+    *at, values = load(wanted, find, scene.vertices, rays, point)
+    if scene.location != "point":
+        values = values_at(scene, cell, corners, wanted)
+    return tuple(
+        project(rays, (*(x[k] for x in at), values[k]), wanted) for k in range(corners.shape[0])
+    )
 
-    *point, value = stage(wanted, load, scene, rays, cell, corners)
-    rows = (*stage(wanted, project, rays, *point), value)
-    return tuple(jnp.stack([row[k] for row in rows]) for k in range(corners.shape[0]))
+
+def project(rays: ShearedRays, at: tuple[Array, ...], wanted: Array) -> Array:
+    """A vertex (4, R) from its coordinates in each ray's permuted axes and its scalar."""
+    x, y, z, value = at
+    # Rows are put together outside: a kernel that chooses by row what to compute is not vectorised.
+    flat = stage(wanted, lambda rays, *at: shear_points(rays, *at)[:2], rays, x, y, z)
+    return jnp.stack([*flat, rays.sign * z, value])
 
 
 def entry_corners(corner: Array) -> Array:

@@ -52,10 +52,16 @@ class ShearedRays:
     sign: Array
     stretch: Array
 
+    @property
+    def eye(self) -> Array:
+        """Depth of the eye from the scene's origin."""
+        return self.sign * self.origin_z
 
-# Rows of a vertex (5, R) as R rays see it: projected coordinates, depth as a pair, and scalar.
-# One array and not five, so that a selection between vertices is one kernel.
-X, Y, Z, Z_LOW, VALUE = range(5)
+
+# Rows of a vertex (4, R) as R rays see it: projected coordinates, depth from the scene's origin
+# (`sign` times the coordinate along k_z, which is exact; `eye` is that of the eye), and scalar.
+# One array and not four, so that a selection between vertices is one kernel.
+X, Y, Z, VALUE = range(4)
 
 
 def shear_rays(origins: Array, directions: Array, scale: Array) -> ShearedRays:

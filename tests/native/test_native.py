@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -189,6 +190,7 @@ def test_a_budget_does_not_change_the_image(dtype):
     whole = jaxvr.render(mesh, camera, transfer, adjoint=adjoint)
     parts = jaxvr.render(mesh, camera, transfer, adjoint=adjoint, budget=7 * 212 * 8)
     np.testing.assert_allclose(whole, parts, atol=EPS[dtype])
-    for budget in (0, -5, "1 GB", float("inf"), float("nan")):
+    bad: list[Any] = [0, -5, "1 GB", float("inf"), float("nan")]
+    for budget in bad:
         with pytest.raises(ValueError, match="budget must be a number of bytes"):
             jaxvr.render(mesh, camera, transfer, budget=budget)
