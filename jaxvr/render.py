@@ -36,7 +36,7 @@ Array = jax.Array
 
 # Rays of a tile, rows and columns of pixels, and so of a batch in float32: enough to hide the cost
 # of starting a kernel, few enough that they take about as many steps and their state stays in
-# cache. In float64 half as many: XLA hands larger kernels to several threads, at more than it saves.
+# cache. In float64 half as many: XLA hands larger kernels to several threads, at a loss.
 TILE = (16, 32)
 BATCH = TILE[0] * TILE[1]
 # Accelerators want many more at once; not measured yet.
