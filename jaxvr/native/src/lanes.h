@@ -6,19 +6,19 @@
 
 #include "real.h"
 
-#define LANES 128  /* rays in a block; its rows stay in the cache */
-#define SLAB_NUMBERS 15
-#define NODE_PAIR 10 /* position, extinction, r, g, b of a slab's lower and upper control point */
-#define ENTRIES 8  /* entries of a ray found at a time */
+#define LANES 128       /* rays in a block; its rows stay in the cache */
+#define ENTRIES 8       /* entries of a ray found at a time */
+#define SLAB_NUMBERS 15 /* see slab.h */
+#define NODE_PAIR 10    /* position, extinction, r, g, b of a slab's lower and upper control point */
 
 enum { VX, VY, VZ, VLOW, VVALUE, VERTEX }; /* rows of a vertex, see trace/shear.py */
 
 /* Rows of numbers. FACE: three vertices of the entry face; WEIGHT: their barycentric weights;
  * APEX: the fourth vertex; LEAVE: weights of the exit face's vertices, OF_B and OF_C: barycentric
- * coordinates of the last two. RECORD: the `Slab` that
- * SLAB names, SLAB_NUMBERS rows. SUMS: compensated optical
- * depth and r, g, b, totals first. FINAL, PIXEL: the same sums at the ray's end and the pixel's
- * cotangent, for derivatives; SBAR: cotangents of the segment's front, back and length. */
+ * coordinates of the last two. RECORD: the numbers of the slab that SLAB names. SUMS: compensated
+ * optical depth and r, g, b, totals first. For derivatives, FINAL and PIXEL: those sums at the ray's
+ * end and the pixel's cotangent; SBAR, RBAR, TBAR: cotangents of the segment's front, back and
+ * length, of the ray's origin, S_x, S_y and stretch, and of the slab's control points. */
 enum {
   ORIGIN, SHEAR_X = ORIGIN + 3, SHEAR_Y = SHEAR_X + 3, SIGN = SHEAR_Y + 3, STRETCH,
   FACE, WEIGHT = FACE + 3 * VERTEX, APEX = WEIGHT + 3, LEAVE = APEX + VERTEX,
@@ -29,7 +29,9 @@ enum {
 };
 enum { A = FACE, B = FACE + VERTEX, C = FACE + 2 * VERTEX };
 /* Rows of integers. FRESH: the segment does not start where the one before has ended, in scalar. */
-enum { RAY, AXES, WORD = AXES + 3, POINT, POSITIVE, DROP, SLAB, FRESH, NEXT, END, LOST, SLOT, INTEGERS };
+enum {
+  RAY, AXES, WORD = AXES + 3, POINT, POSITIVE, DROP, SLAB, FRESH, NEXT, END, LOST, SLOT, INTEGERS
+};
 
 typedef struct {
   _Alignas(64) real row[ALL_ROWS][LANES];
