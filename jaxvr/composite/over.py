@@ -85,11 +85,16 @@ class Over:
             compensated.add(state.rgb, through[None] * rgb),
         )
 
+    @property
+    def enough(self) -> float:
+        """The optical depth at which a ray ends; infinite if none ends so."""
+        return -math.log(self.termination) if self.termination else math.inf
+
     def ended(self, state: OverState) -> Array | None:
         """Rays (R,) that need nothing from behind; None if no ray ever ends so."""
         if self.termination == 0:
             return None
-        return compensated.value(state.depth) >= -math.log(self.termination)
+        return compensated.value(state.depth) >= self.enough
 
     def finish(self, state: OverState) -> Array:
         """Premultiplied RGBA (4, R)."""

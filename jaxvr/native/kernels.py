@@ -5,7 +5,6 @@ Rays are flat here, (N,); the loops make blocks of their own, which XLA's thread
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import jax
@@ -127,18 +126,13 @@ def _world(scene: Any, rays: Any) -> tuple[tuple[Any, ...], int]:
     if isinstance(rays, Runs):
         return (*scene, rays.first.reshape(-1), rays.end.reshape(-1)), rays.first.size
     mesh = scene.mesh
-    points = mesh.coordinates.reshape(3, -1)
-    at_points = mesh.location == "point"
-    values = mesh.values if at_points else jnp.zeros_like(points[0])
     axes = (rays.axis_x, rays.axis_y, rays.axis_z)
     numbers = (
         *(rays.origin_x, rays.origin_y, rays.origin_z, rays.shear_x, rays.shear_y),
         *(rays.shear_x_low, rays.shear_y_low, rays.sign, rays.stretch),
     )
     arrays = (
-        jnp.concatenate([points, values[None]]).T,
-        jnp.zeros(1, points.dtype) if at_points else mesh.values,
-        *(mesh.cells, mesh.neighbors),
+        *(mesh.vertices, mesh.values, mesh.cells, mesh.neighbors),
         *(scene.boxes.low, scene.boxes.high, mesh.faces),
         *(jnp.stack([x.reshape(-1) for x in rows]) for rows in (axes, numbers)),
         np.array([LOCATIONS[mesh.location], mesh.seams], np.int32),
@@ -150,10 +144,9 @@ def _optics(table: Nodes, integrator: Any, over: Over) -> tuple[Any, ...]:
     dtype = table.position.dtype
     small = RULES[integrator.accuracy]
     rule = small or rule_for(dtype)
-    enough = math.inf if over.termination == 0 else -math.log(over.termination)
     thin = thin_rule(dtype)
     rows = (_rows(r).astype(dtype) for r in (rule, thin))
-    numbers = np.array([rule.depth, small is not None, thin.depth, enough], dtype)
+    numbers = np.array([rule.depth, small is not None, thin.depth, over.enough], dtype)
     return table.position, slabs_of(table), *rows, numbers
 
 

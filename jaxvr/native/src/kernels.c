@@ -287,12 +287,11 @@ EXPORT Failure jaxvr_render_pull(XLA_FFI_CallFrame *frame) {
   task.count = task.world.rays.count;
   task.rays_bar = size_of(frame, 3) ? result(frame, 3) : NULL;
   int64_t all = task.vertices_size + task.values_size;
-  task.table_bar = calloc(task.groups * task.table_size + 1, sizeof(double));
+  double *tables = calloc(task.groups * task.table_size + 1, sizeof(double));
   real *scene = calloc(task.groups * all + 1, sizeof(real));
   Failure failure = NULL;
-  if (task.table_bar && scene) {
-    double *tables = task.table_bar;
-    if (!task.table_size) task.table_bar = NULL;
+  if (tables && scene) {
+    if (task.table_size) task.table_bar = tables;
     if (all) task.vertices_bar = scene, task.values_bar = scene + task.groups * task.vertices_size;
     failure = in_parallel(frame, task.groups, pull_group, &task);
     if (!failure && all) {
@@ -301,9 +300,8 @@ EXPORT Failure jaxvr_render_pull(XLA_FFI_CallFrame *frame) {
       memcpy(result(frame, 2), task.values_bar, task.values_size * sizeof(real));
     }
     if (task.table_bar) sum_tables(frame, &task);
-    task.table_bar = tables;
   } else atomic_store(&task.failed, 1);
-  free(task.table_bar);
+  free(tables);
   free(scene);
   return finish(frame, &task, failure);
 }

@@ -8,8 +8,7 @@
 
 #define STATUS_LOST 1
 
-
-/* axes (3, N); numbers (11, N): origin, S_x, S_y, their lost parts, sign, stretch (see Lanes). */
+/* axes (3, N); numbers (9, N): origin, S_x, S_y, their lost parts, sign, stretch. */
 typedef struct {
   int64_t count;
   const int32_t *axes;
