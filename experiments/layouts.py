@@ -51,7 +51,8 @@ from experiments.common import camera_of, diagonal, median_of, read_volume, tabl
 from jaxvr._core import status as bits
 from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment
-from jaxvr.render import BATCH, TILE
+from jaxvr.render import BATCH
+from jaxvr.view.tiles import TILE
 from jaxvr.trace.entry import build_boxes, no_entries, search
 from jaxvr.trace.face import Face, choose, opposite_edges, sizes_of
 from jaxvr.trace.local import edges_to_apex, exit_face, leave_by

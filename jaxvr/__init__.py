@@ -12,11 +12,11 @@ has no gradient, depths and scalars are arithmetic on local data and have one. A
 shade many, since segments do not depend on the transfer function.
 
 Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, `view`, `optics`,
-`trace`, `composite`, `native`, `adjoint`, `render`, `fit`, `plot`, `cli`. Those of `native` are
+`order`, `trace`, `composite`, `native`, `adjoint`, `render`, `fit`, `plot`, `cli`. Those of `native` are
 compiled loops, which serve where they can with the same results.
 """
 
-from jaxvr import native
+from jaxvr import native, order
 from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay
 from jaxvr.composite import Over
@@ -31,7 +31,15 @@ from jaxvr.optics import (
     TransferFunction,
 )
 from jaxvr.render import render, render_rays, shade, trace
-from jaxvr.trace import RayCast, Segments
+from jaxvr.trace import (
+    Fragments,
+    KBuffer,
+    KMap,
+    RayCast,
+    Segments,
+    measure_k,
+    rasterize,
+)
 from jaxvr.view import Camera, psnr, ssim
 from jaxvr.volume import (
     TetMesh,
@@ -39,6 +47,7 @@ from jaxvr.volume import (
     list_fields,
     read_mesh,
     read_plot3d,
+    refine,
     write_mesh,
 )
 
@@ -52,6 +61,9 @@ __all__ = [
     "FitError",
     "FitResult",
     "Forward",
+    "Fragments",
+    "KBuffer",
+    "KMap",
     "Over",
     "PartialPreIntegration",
     "PreIntegration",
@@ -67,10 +79,14 @@ __all__ = [
     "fit",
     "fit_parameters",
     "list_fields",
+    "measure_k",
     "native",
+    "order",
     "psnr",
+    "rasterize",
     "read_mesh",
     "read_plot3d",
+    "refine",
     "render",
     "render_rays",
     "shade",

@@ -30,14 +30,14 @@ from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
 from jaxvr.trace import AbstractTracer, RayCast, Recorded, Segments
 from jaxvr.trace.recorded import fill, record
 from jaxvr.view.camera import Camera
+from jaxvr.view.tiles import TILE, batches, tile, tile_order, untile
 from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
 
-# Rays of a tile, rows and columns of pixels, and so of a batch in float32: enough to hide the cost
-# of starting a kernel, few enough that they take about as many steps and their state stays in
-# cache. In float64 half as many: XLA hands larger kernels to several threads, at a loss.
-TILE = (16, 32)
+# Rays of a batch in float32, a tile of the image: enough to hide the cost of starting a kernel, few
+# enough that they take about as many steps and their state stays in cache. In float64 half as many:
+# XLA hands larger kernels to several threads, at a loss.
 BATCH = TILE[0] * TILE[1]
 # Accelerators want many more at once; not measured yet.
 ACCELERATOR_BATCH = 1 << 18
@@ -57,7 +57,8 @@ def render(
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
     budget: int | None = None,
-) -> Array:
+    status: bool = False,
+) -> Any:
     """An image of a volume.
 
     Args:
@@ -70,27 +71,32 @@ def render(
       budget: bytes for the state of the rays that march at once, beside the volume and the image;
         None takes what measured fastest, 0.5 MB on CPUs and 220 MB on accelerators in float32.
         Compiled loops (see `jaxvr.native`) need 0.2 MB a core whatever it is.
+      status: also return the status bits (height, width) int32 of the pixels, instead of raising
+        what they say: see `jaxvr.check`.
 
     Returns:
       image (height, width, 4): premultiplied linear RGBA in the volume's dtype, row 0 on top.
 
     Raises:
-      ValueError: for NaN or infinite operands, or a budget below one byte. RenderError: if a ray
-        could not be followed. Of values only where they are concrete, not inside your own `jit`.
+      ValueError: for NaN or infinite operands, a budget below one byte, or a compositor that goes
+        back to front with a tracer that cannot. RenderError: if a ray could not be followed. Of
+        values only where they are concrete, not inside your own `jit`.
 
     Differentiable in `volume.values`, `volume.points`, `transfer` (positions, colors, extinctions),
     `camera` (eye, target, up, fov or extent) and `background`. Notes on kinks are with `RayCast`,
     `jaxvr.optics.partition` and the adjoints.
     """
-    pipeline = Pipeline(tracer or RayCast(), integrator or Analytic(), compositor or Over())
+    pipeline = _pipeline(tracer or RayCast(), integrator, compositor)
     camera = _camera_of(camera, _volume_of(volume))
     transfer = _transfer_of(transfer, volume)
-    image, status = _render(
+    image, bits = _render(
         *(pipeline, adjoint or Replay(), _batch_size(budget, volume), volume, camera, transfer),
         _background(background),
     )
-    if is_concrete(status):
-        check(status)
+    if status:
+        return image, bits
+    if is_concrete(bits):
+        check(bits)
     return image
 
 
@@ -121,7 +127,7 @@ def render_rays(
       rgba (..., 4), premultiplied linear, in the volume's dtype. Differentiable in origins and
       directions too.
     """
-    pipeline = Pipeline(tracer or RayCast(), integrator or Analytic(), compositor or Over())
+    pipeline = _pipeline(tracer or RayCast(), integrator, compositor)
     origins, directions = _rays_of(origins, directions, _volume_of(volume))
     transfer = _transfer_of(transfer, volume)
     rgba, bits = _render_rays(
@@ -164,7 +170,7 @@ def trace(
     tracer, volume = tracer or RayCast(), _volume_of(volume)
     if isinstance(camera, Camera):
         camera = _camera_of(camera, volume)
-        shape, order = (camera.height, camera.width), _tile_order(camera.height, camera.width)
+        shape, order = (camera.height, camera.width), tile_order(camera.height, camera.width)
         origins, directions = (x.reshape(-1, 3)[order] for x in camera.rays())
     else:
         origins, directions = _rays_of(*camera, volume)
@@ -214,10 +220,20 @@ def shade(
       image (height, width, 4), or (..., 4) for segments of rays. Differentiable in `transfer`,
       `segments.scalar`, `segments.length` and `background`.
     """
-    pipeline = Pipeline(Recorded(), integrator or Analytic(), compositor or Over())
+    pipeline = _pipeline(Recorded(), integrator, compositor)
     transfer = _transfer_of(transfer, segments)
     size = _batch_size(budget, segments)
     return _shade(pipeline, adjoint or Replay(), size, segments, transfer, _background(background))
+
+
+def _pipeline(
+    tracer: AbstractTracer, integrator: AbstractIntegrator | None, compositor: Over | None
+) -> Pipeline:
+    """With what the compositor needs: segments from behind, if it goes back to front."""
+    integrator, compositor = integrator or Analytic(), compositor or Over()
+    if compositor.backwards:
+        tracer, integrator = tracer.reversed(), integrator.reversed()
+    return Pipeline(tracer, integrator, compositor)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -225,10 +241,10 @@ def _render(pipeline, adjoint, size, volume, camera, transfer, background):
     # Under a user's own jit operands may be constants: XLA must not compute with them itself.
     volume, camera = lax.optimization_barrier((volume, camera))
     height, width = camera.height, camera.width
-    origins, directions = (_tile(x) for x in camera.rays())
+    origins, directions = (tile(x) for x in camera.rays())
     rgba, status = _run(pipeline, adjoint, size, volume, origins, directions, transfer)
-    rgba = _over(_untile(rgba, height, width), background)
-    return rgba, _untile(status[:, None], height, width)[..., 0]
+    rgba = _over(untile(rgba, height, width), background)
+    return rgba, untile(status[:, None], height, width)[..., 0]
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -244,7 +260,7 @@ def _render_rays(pipeline, adjoint, size, volume, origins, directions, transfer,
 def _shade(pipeline, adjoint, size, segments, transfer, background):
     segments = lax.optimization_barrier(segments)  # as above
     scene = pipeline.tracer.prepare(segments)
-    rays, count = _batches(size, (segments.start[:-1], segments.start[1:]))
+    rays, count = batches(size, (segments.start[:-1], segments.start[1:]))
     rays = pipeline.tracer.prepare_rays(scene, *rays)
     rgba = _finish(pipeline, adjoint, scene, rays, transfer, scene.scalar.dtype, count)[0]
     rgba = jnp.zeros_like(rgba).at[segments.order].set(rgba, unique_indices=True)
@@ -254,7 +270,7 @@ def _shade(pipeline, adjoint, size, segments, transfer, background):
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _count(tracer, native, size, volume, origins, directions):
     scene = tracer.prepare(volume)
-    rays, count = _batches(size, (origins, directions))
+    rays, count = batches(size, (origins, directions))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(*rays)
     found = compiled.kernels.count_nodes(scene, rays) if native else record(tracer, scene, rays)
     return tuple(x.reshape(-1)[:count] for x in found)
@@ -263,7 +279,7 @@ def _count(tracer, native, size, volume, origins, directions):
 @partial(jax.jit, static_argnums=(0, 1, 2, 7))
 def _fill(tracer, native, size, volume, origins, directions, start, total):
     scene = tracer.prepare(volume)
-    (origins, directions, start), _ = _batches(size, (origins, directions, start))
+    (origins, directions, start), _ = batches(size, (origins, directions, start))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
     fill_all = compiled.kernels.fill_nodes if native else partial(fill, tracer)
     return fill_all(scene, rays, start, total)
@@ -272,7 +288,7 @@ def _fill(tracer, native, size, volume, origins, directions, start, total):
 def _run(pipeline, adjoint, size, volume, origins, directions, transfer):
     """rgba (R, 4) and status (R,) of rays (R, 3)."""
     scene = pipeline.tracer.prepare(volume)
-    rays, count = _batches(size, (origins, directions))
+    rays, count = batches(size, (origins, directions))
     rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(*rays)
     return _finish(pipeline, adjoint, scene, rays, transfer, origins.dtype, count)
 
@@ -292,42 +308,6 @@ def _batch_size(budget: Any, volume: Any) -> int:
     if not isinstance(budget, int | float | np.number) or not 1 <= budget < math.inf:
         raise ValueError(f"budget must be a number of bytes, at least 1, but is {budget!r}.")
     return max(int(budget) // (NUMBERS_PER_RAY * itemsize), 1)
-
-
-def _batches(most: int, arrays: Any) -> tuple[Any, int]:
-    """Arrays (R, ...) as batches (n, size, ...), the last filled up with copies; and R."""
-    count = arrays[0].shape[0]
-    size = min(most, max(count, 1))
-    number = -(-count // size)
-
-    def split(x):
-        x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (number * size - count, *x.shape[1:]))])
-        return x.reshape(number, size, *x.shape[1:])
-
-    return tuple(split(x) for x in arrays), count
-
-
-def _tile(x: Array) -> Array:
-    """An image (height, width, C) as rays (R, C), tile after tile, with its rim repeated to fill
-    the last ones. Reshapes and transposes only: their derivatives are the same."""
-    (rows, columns), (height, width, channels) = TILE, x.shape
-    x = jnp.pad(x, ((0, -height % rows), (0, -width % columns), (0, 0)), mode="edge")
-    x = x.reshape(x.shape[0] // rows, rows, x.shape[1] // columns, columns, channels)
-    return x.transpose(0, 2, 1, 3, 4).reshape(-1, channels)
-
-
-def _untile(x: Array, height: int, width: int) -> Array:
-    """Back from `_tile`: (R, C) to (height, width, C)."""
-    rows, columns = TILE
-    x = x.reshape(-(-height // rows), -(-width // columns), rows, columns, x.shape[-1])
-    x = x.transpose(0, 2, 1, 3, 4)
-    return x.reshape(x.shape[0] * rows, -1, x.shape[-1])[:height, :width]
-
-
-def _tile_order(height: int, width: int) -> np.ndarray:
-    """Pixel numbers (height * width,), tile after tile."""
-    rows, columns = (x.ravel() for x in np.mgrid[0:height, 0:width])
-    return np.lexsort((columns, rows, columns // TILE[1], rows // TILE[0])).astype(np.int32)
 
 
 def _over(rgba: Array, background: Array | None) -> Array:

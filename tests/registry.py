@@ -24,7 +24,9 @@ class Entry:
     test_registry, whose transfer function has a jump. slope: difference of its derivative with
     respect to colours and extinctions, relative. None for both: equal to rounding, in all
     derivatives. variant: the same class as another entry, or almost; crossed with all adjoints in
-    `shade` only. only: names of the integrators that an adjoint can do, or None for all.
+    `shade` only. only: names of the integrators that an adjoint can do, or None for all. follows: a
+    tracer of the same segments, which is crossed with everything; here all adjoints will do, and
+    other data with one of them.
     """
 
     name: str
@@ -35,12 +37,16 @@ class Entry:
     forward: bool = True
     reverse: bool = True
     only: tuple[str, ...] | None = None
+    follows: str | None = None
 
     def can(self, integrator: Entry) -> bool:
         return self.only is None or integrator.name in self.only
 
 
-TRACERS = [Entry("RayCast", jaxvr.RayCast)]
+TRACERS = [
+    Entry("RayCast", jaxvr.RayCast),
+    Entry("KBuffer", lambda: jaxvr.KBuffer(k=8), follows="RayCast"),
+]
 
 _SMALL = (24, 24, 8)
 INTEGRATORS = [
@@ -79,6 +85,7 @@ ADJOINTS = [
 COMPOSITORS = [
     Entry("Over", jaxvr.Over),
     Entry("ending", lambda: jaxvr.Over(termination=0.5), 0.5, variant=True),
+    Entry("backwards", lambda: jaxvr.Over(direction="back to front"), variant=True),
 ]
 
 
@@ -118,6 +125,13 @@ def combinations() -> Iterator[tuple[Entry, Entry, Entry, str]]:
     """All with all on point data, and all tracers and adjoints on the other kinds of field, which
     integrators do not see. (`Recorded`, the tracer of `shade`, has its own test.)"""
     for tracer in TRACERS:
+        if tracer.follows:
+            for adjoint in ADJOINTS:
+                if not adjoint.only:  # compiled loops cast rays
+                    yield tracer, INTEGRATORS[0], adjoint, "point"
+            for mesh in MESHES[1:]:
+                yield tracer, INTEGRATORS[0], ADJOINTS[0], mesh
+            continue
         for adjoint in ADJOINTS:
             for integrator in INTEGRATORS:
                 if not integrator.variant and adjoint.can(integrator):

@@ -71,7 +71,7 @@ def _is_mpl(node) -> bool:
 PUBLIC = """
 TetMesh read_mesh write_mesh read_plot3d Camera TransferFunction render render_rays trace
 shade fit psnr ssim datasets Analytic PartialPreIntegration PreIntegration Quadrature AverageColor
-ConstantExtinction RayCast Over Replay Direct Forward check
+ConstantExtinction RayCast KBuffer measure_k rasterize refine order Over Replay Direct Forward check
 """.split()
 
 

@@ -136,19 +136,21 @@ def compare(found, same_integrator, exact, entry):
 def test_same_image_and_gradient(tracer, integrator, adjoint, location):
     everything = integrator.name == "Analytic"  # integrators do not see geometry
     found = derivative(tracer.name, integrator.name, adjoint.name, location, everything)
-    same = derivative(tracer.name, integrator.name, "Direct", location, everything)
+    reference = tracer.follows or tracer.name
+    same = derivative(reference, integrator.name, "Direct", location, everything)
     exact = derivative("RayCast", "Analytic", "Direct", location, everything)
     compare(found, same, exact, integrator)
 
 
 @functools.cache
-def shaded(integrator: str, adjoint: str, compositor: str = "Over"):
+def shaded(integrator: str, adjoint: str, compositor: str = "Over", location: str = "point"):
     """Traced segments: derivatives with respect to their scalars and lengths too."""
-    mesh, (_, _, transfer, camera), tangents = setting("point")
+    mesh, (_, _, transfer, camera), tangents = setting(location)
     segments = jaxvr.trace(mesh, camera)
     rng = np.random.default_rng(3)
     args = (segments.scalar, segments.length, transfer)
     moves = [jnp.asarray(rng.normal(size=x.shape)) for x in args[:2]]
+    moves[1] = jnp.where(segments.length == 0, 0, moves[1])  # jumps of the scalar stay jumps
     names = {"integrator": integrator, "compositor": compositor, "adjoint": adjoint}
     nouns = {noun: ENTRIES[name].make() for noun, name in names.items()}
 
@@ -169,6 +171,19 @@ def shaded(integrator: str, adjoint: str, compositor: str = "Over"):
 def test_same_shaded_image_and_gradient(integrator, adjoint):
     found = shaded(integrator.name, adjoint.name)
     compare(found, shaded(integrator.name, "Direct"), shaded("Analytic", "Direct"), integrator)
+
+
+@pytest.mark.parametrize(
+    "integrator, adjoint, location",
+    [("Analytic", a.name, "corner") for a in registry.ADJOINTS if a.name != "compiled"]
+    + [("ConstantExtinction", "Replay", "point")],
+)
+def test_shaded_back_to_front(integrator, adjoint, location):
+    found = shaded(integrator, adjoint, "backwards", location)
+    same = shaded(
+        integrator, "compiled" if integrator == "Analytic" else "Direct", "Over", location
+    )
+    compare(found, same, same, ENTRIES["Analytic"])
 
 
 @pytest.mark.parametrize("adjoint", registry.ADJOINTS, ids=lambda x: x.name)

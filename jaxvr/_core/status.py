@@ -13,6 +13,7 @@ import numpy as np
 
 LOST = 1
 STEPS = 2
+K_TOO_SMALL = 4
 
 _MEANING = {
     LOST: (
@@ -23,6 +24,11 @@ _MEANING = {
     STEPS: (
         "reached the maximum number of steps",
         "Increase `max_steps` of the adjoint.",
+    ),
+    K_TOO_SMALL: (
+        "needed a k-buffer with more entries",
+        "Increase `k` of `KBuffer` (`jaxvr.measure_k` tells how many the view needs), or take the "
+        "image as it is with `render(..., status=True)`.",
     ),
 }
 

@@ -18,6 +18,16 @@ then short of
     |sum_{j > i} T_j c_j| <= C (T_{i+1} - T_end) <= C T_{i+1}        0 <= T_{i+1} - T_end <= T_{i+1}
 
 since a piece of depth S emits at most C (1 - exp(-S)), which telescopes.
+
+Back to front the same is a recurrence, R_i = c_i + exp(-S_i) R_{i+1}, with what lies in front of a
+piece seen last. Once all depths are known, so is T_i = exp(-(sum_j S_j - sum_{j >= i} S_j)), and
+
+    d rgb / d c_i = T_i           d rgb / d S_i = -T_i exp(-S_i) R_{i+1} = -T_{i+1} R_{i+1}
+
+in which R_{i+1} is the state before the piece: again nothing is divided. The recurrence in floats:
+where a piece hides less than half, 1 - exp(-S_i) of R_{i+1} is taken from a compensated sum, so
+that many thin pieces cost no digits; else R_{i+1} is multiplied by exp(-S_i), since the difference
+would cancel. Roundings then are those of what is left, and halve with each such piece.
 """
 
 from __future__ import annotations
@@ -25,7 +35,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +45,7 @@ from jaxvr.numerics.compensated import Sum
 from jaxvr.numerics.moments import opacity
 
 Array = jax.Array
+Direction = Literal["front to back", "back to front"]
 
 
 class OverState(NamedTuple):
@@ -46,7 +57,7 @@ class OverState(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Over:
-    """Emission and absorption (the density emitter of Williams and Max 1992), front to back.
+    """Emission and absorption (the density emitter of Williams and Max 1992).
 
     termination: a ray ends behind the first segment where its transmittance is at most this; 0
     never ends one before its last segment, and costs nothing. What is left out is bounded, whatever
@@ -58,11 +69,17 @@ class Over:
     what lies behind them has none. As a function of the parameters that image has steps, of the
     size of the bound, where a ray comes to end one cell sooner.
 
+    direction: "front to back", or "back to front" as projected cells are composited: the same image
+    and gradients to rounding, and no faster. It asks for a tracer that can stream segments from
+    behind: `shade` can, of tracers those with a way to be `reversed`, and `RayCast` cannot.
+
     Raises:
-      ValueError: if `termination` is not a number in [0, 1).
+      ValueError: if `termination` is not a number in [0, 1), for another direction, and for both at
+        once: from behind, nothing is hidden yet.
     """
 
     termination: float = 0.0
+    direction: Direction = "front to back"
 
     def __post_init__(self):
         number = isinstance(self.termination, numbers.Real)
@@ -72,13 +89,30 @@ class Over:
                 "transmittance at which a ray ends: 0 follows every ray to its last segment, "
                 "1 / 255 leaves out what 8 bits cannot show."
             )
+        if self.direction not in get_args(Direction):
+            raise ValueError(
+                f"direction must be one of {list(get_args(Direction))}, but is {self.direction!r}."
+            )
+        if self.backwards and self.termination > 0:
+            raise ValueError(
+                f"termination is {self.termination} and direction 'back to front', but a ray that "
+                "comes from behind cannot end early: what hides the rest is seen last. Leave "
+                "termination at 0, or go front to back."
+            )
+
+    @property
+    def backwards(self) -> bool:
+        """Whether pieces are to be added farthest first."""
+        return self.direction == "back to front"
 
     def start(self, rays: int, dtype: Any) -> OverState:
         zero, zeros = jnp.zeros(rays, dtype), jnp.zeros((3, rays), dtype)
         return OverState((zero, zero), (zeros, zeros))
 
     def add(self, state: OverState, rgb: Array, depth: Array) -> OverState:
-        """The state behind a piece with premultiplied rgb (3, R) and optical depth (R,)."""
+        """The state with one more piece, of premultiplied rgb (3, R) and optical depth (R,)."""
+        if self.backwards:
+            return _add_in_front(state, rgb, depth)
         through = compensated.exp_minus(state.depth)
         return OverState(
             compensated.add(state.depth, depth),
@@ -105,7 +139,30 @@ class Over:
         self, before: OverState, after: OverState, final: OverState, cotangent: Array
     ) -> tuple[Array, Array]:
         """Cotangents of one piece's rgb (3, R) and depth (R,), given that of the RGBA (4, R)."""
+        if self.backwards:
+            return _pull_back_in_front(before, after, final, cotangent)
         behind = compensated.difference(final.rgb, after.rgb)
         through = compensated.exp_minus(final.depth)
         depth_bar = cotangent[3] * through - jnp.sum(cotangent[:3] * behind, axis=0)
         return compensated.exp_minus(before.depth)[None] * cotangent[:3], depth_bar
+
+
+def _add_in_front(state: OverState, rgb: Array, depth: Array) -> OverState:
+    """The state with a piece in front of all others."""
+    hides = opacity(depth)
+    thin = hides < 0.5
+    factor = jnp.where(thin, 1, jnp.exp(-depth))[None]
+    old = (factor * state.rgb[0], factor * state.rgb[1])
+    taken = jnp.where(thin, hides, 0)[None] * compensated.value(old)
+    return OverState(compensated.add(state.depth, depth), compensated.add(old, rgb - taken))
+
+
+def _pull_back_in_front(
+    before: OverState, after: OverState, final: OverState, cotangent: Array
+) -> tuple[Array, Array]:
+    """`Over.pull_back` for such a piece: T_i by what is in front of it, T_{i+1} with itself."""
+    to, past = (jnp.exp(-compensated.difference(final.depth, s.depth)) for s in (after, before))
+    behind = past[None] * compensated.value(before.rgb)
+    through = compensated.exp_minus(final.depth)
+    depth_bar = cotangent[3] * through - jnp.sum(cotangent[:3] * behind, axis=0)
+    return to[None] * cotangent[:3], depth_bar

@@ -48,7 +48,9 @@ def covers(wanted: bool | None, dtype: Any, *nouns: Any) -> bool:
     if wanted is False:
         return False
     others = [n for n in nouns if type(n) not in (RayCast, Recorded, Analytic, Over)]
-    if others:
+    if any(isinstance(n, Over) and n.backwards for n in nouns) or Recorded(reverse=True) in nouns:
+        reason = "They go front to back."
+    elif others:
         reason = f"There are none for {type(others[0]).__name__}."
     else:
         reason = missing(dtype)

@@ -59,6 +59,10 @@ class AbstractIntegrator(abc.ABC):
         """
 
     @abc.abstractmethod
+    def reversed(self) -> AbstractIntegrator:
+        """The same integrals for segments that come from behind: light leaves by their `back`."""
+
+    @abc.abstractmethod
     def prepare(self, transfer: TransferFunction, dtype: Any, longest: Array) -> Any:
         """The table that `step` looks up, differentiable with respect to `transfer`.
 
@@ -131,6 +135,9 @@ class AbstractSlabIntegrator(AbstractIntegrator):
         operands = (extinction_front, extinction_back, color_front, color_back, length)
         return slab_of(self.weights, *operands)
 
+    def reversed(self):
+        return SlabsFromBehind(self)
+
     def prepare(self, transfer, dtype, longest):
         return nodes_of(transfer, dtype)
 
@@ -185,6 +192,27 @@ class AbstractSlabIntegrator(AbstractIntegrator):
         nodes = jnp.zeros((count, 5), gradient.dtype)
         nodes = nodes.at[left].add(gradient[:, :5]).at[right].add(gradient[:, 5:])
         return Nodes(nodes[:, 0], nodes[:, 1:].T)
+
+
+@dataclasses.dataclass(frozen=True)
+class SlabsFromBehind(AbstractSlabIntegrator):
+    """The slabs of `other`, with light that leaves by the back.
+
+    With its ends exchanged a slab has the weights w_front and w_back of `weights(b, a)`, so that
+
+        rgb = C_back w_front + C_front w_back = C_front w + (C_back - C_front) (w - w_back)
+
+    Pieces are cut as they come, so this is all that there is to turn.
+    """
+
+    other: AbstractSlabIntegrator
+
+    def prepare(self, transfer, dtype, longest):
+        return self.other.prepare(transfer, dtype, longest)
+
+    def weights(self, a, b):
+        w, w_back = self.other.weights(b, a)
+        return w, w - w_back
 
 
 def shade_slab(weights: Weights, piece: Ends) -> tuple[Array, Array]:

@@ -47,12 +47,18 @@ JUMP_WIDTH = 1e-20
 class Segment(NamedTuple):
     """Straight pieces of rays inside one cell, where the scalar is linear.
 
-    front, back (R,): scalar at the two ends, nearer the eye first. length (R,): world length.
+    front, back (R,): scalar at the two ends, that first which the stream comes to first: nearer the
+    eye, or farther from it where segments come from behind. length (R,): world length.
     """
 
     front: Array
     back: Array
     length: Array
+
+
+def turned(segment: Segment) -> Segment:
+    """The same pieces, passed the other way."""
+    return Segment(segment.back, segment.front, segment.length)
 
 
 class Cursor(NamedTuple):

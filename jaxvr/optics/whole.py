@@ -7,6 +7,7 @@ of a slab: the rows' cotangents are scattered, and no dense gradient of the tabl
 from __future__ import annotations
 
 import abc
+import dataclasses
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 from jaxvr._core.pytree import pytree
 from jaxvr._core.stage import stage
 from jaxvr.optics.integrator import AbstractIntegrator, shade_slab, slab_of
-from jaxvr.optics.partition import Cursor, Ends, Segment, locate, nodes_of
+from jaxvr.optics.partition import Cursor, Ends, Segment, locate, nodes_of, turned
 
 Array = jax.Array
 
@@ -39,6 +40,9 @@ class AbstractWholeIntegrator(AbstractIntegrator):
     def blend(self, frame: Any, rows: Array, segment: Segment) -> tuple[Array, Array]:
         """rgb (3, R), premultiplied, and optical depth (R,) from rows (C, M, R); differentiable in
         all operands."""
+
+    def reversed(self):
+        return WholeFromBehind(self)
 
     def shorten(self, table, image_only):
         return table  # a segment is one piece already
@@ -75,6 +79,26 @@ class AbstractWholeIntegrator(AbstractIntegrator):
 
     def gradient_finish(self, table, gradient):
         return gradient
+
+
+@dataclasses.dataclass(frozen=True)
+class WholeFromBehind(AbstractWholeIntegrator):
+    """The segments of `other`, with light that leaves by the back."""
+
+    other: AbstractWholeIntegrator
+
+    def slab(self, extinction_front, extinction_back, color_front, color_back, length):
+        ends = (extinction_back, extinction_front, color_back, color_front)
+        return self.other.slab(*ends, length)
+
+    def prepare(self, transfer, dtype, longest):
+        return self.other.prepare(transfer, dtype, longest)
+
+    def address(self, table, segment):
+        return self.other.address(table, turned(segment))
+
+    def blend(self, frame, rows, segment):
+        return self.other.blend(frame, rows, turned(segment))
 
 
 def _gather(rows: Array, ids: Array) -> Array:

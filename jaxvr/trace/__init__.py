@@ -6,6 +6,7 @@ A tracer is a frozen dataclass without arrays, split in the manner of an iterati
 - `start` and `step` move rays (R,) from segment to segment, in lock step: a `state` shows the
   current segment, which rays have one (`active`), and which of those segments do not start at the
   scalar where the one before ended (`fresh`);
+- `reversed` is the tracer of the same segments from behind, where there is one;
 - `pull_back` takes the cotangents of the current segment back to the floats of the scene and the
   rays, from the local operands alone. The replaying adjoint needs no more than that.
 
@@ -14,7 +15,20 @@ one file, listed here and in the tests' registry.
 """
 
 from jaxvr.trace.base import AbstractTracer
+from jaxvr.trace.kbuffer import KBuffer
+from jaxvr.trace.measure import KMap, measure_k
+from jaxvr.trace.rasterize import Fragments, rasterize
 from jaxvr.trace.raycast import RayCast
 from jaxvr.trace.recorded import Recorded, Segments
 
-__all__ = ["AbstractTracer", "RayCast", "Recorded", "Segments"]
+__all__ = [
+    "AbstractTracer",
+    "Fragments",
+    "KBuffer",
+    "KMap",
+    "RayCast",
+    "Recorded",
+    "Segments",
+    "measure_k",
+    "rasterize",
+]

@@ -48,6 +48,15 @@ class AbstractTracer(abc.ABC):
     """An ordered stream of segments for each ray."""
 
     @abc.abstractmethod
+    def reversed(self) -> AbstractTracer:
+        """A tracer of the same segments from behind: the farthest first, each with its farther end
+        as its `front`.
+
+        Raises:
+          ValueError: if it has no such way, naming what has.
+        """
+
+    @abc.abstractmethod
     def prepare(self, volume: Any) -> Any:
         """The scene: a pytree of what steps gather from. Floats in it depend differentiably on
         those of the volume."""

@@ -24,6 +24,7 @@ since the l_i add up to one. Points and scalars get theirs scattered to where th
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -39,10 +40,11 @@ from jaxvr.trace.face import (
     crossing_at,
     edges,
     is_positive,
+    opposite_edges,
     sizes_of,
     sum_of,
 )
-from jaxvr.trace.scene import Scene, points_at, value_slots
+from jaxvr.trace.scene import Scene, entry_corners, fetch, points_at, value_slots
 from jaxvr.trace.shear import VALUE, ShearedRays, X, Y, Z
 from jaxvr.volume import packing
 
@@ -163,6 +165,43 @@ def _by_corner(share: Array, corner: Array) -> tuple[Array, ...]:
     )
 
 
+def gradient_zeros(scene: Scene, rays: ShearedRays, asked: Scene, by_rays: bool) -> Any:
+    """`AbstractTracer.gradient_start`: ((values, coordinates), rays), None for what is not asked
+    for. asked: True at leaves of the scene whose gradients are."""
+    for_scene = (
+        jnp.zeros_like(scene.values) if asked.values else None,
+        jnp.zeros_like(scene.coordinates) if asked.coordinates else None,
+    )
+    return for_scene, (jnp.zeros_like(rays.origin_x),) * 6 if by_rays else None
+
+
+def as_scene(scene: Scene, gradient: Any) -> Scene:
+    """An accumulated gradient of the scene in its form, zero where none was asked for."""
+    values, coordinates = gradient
+    out = jax.tree.map(jnp.zeros_like, scene)
+    if values is not None:
+        out = dataclasses.replace(out, values=values)
+    if coordinates is not None:
+        out = dataclasses.replace(out, coordinates=coordinates)
+    return out
+
+
+def as_rays(rays: ShearedRays, gradient: Any) -> ShearedRays:
+    """The same of rays."""
+    out = jax.tree.map(jnp.zeros_like, rays)
+    if gradient is None:
+        return out
+    names = ("origin_x", "origin_y", "origin_z", "shear_x", "shear_y", "stretch")
+    return dataclasses.replace(out, **dict(zip(names, gradient, strict=True)))
+
+
+def segment_between(near: Crossing, far: Crossing, stretch: Array) -> Segment:
+    """The segment between two crossings, of which `far` is not the nearer one."""
+    depth = jnp.stack([near.z, near.z_low])
+    no = jnp.zeros(stretch.shape, bool)
+    return make_segment(depth, near.value, far, no, stretch)[0]
+
+
 def pull_back_cell(
     scene: Scene, rays: ShearedRays, state: Any, cotangent: Segment, gradient: Any
 ) -> Any:
@@ -202,19 +241,98 @@ def pull_back_cell(
         bars = [i * q.s + o * p.s for i, o in shares]
         values = values.at[slots].add(jnp.stack(bars))
 
-    def in_space(v: _Pulled) -> tuple[Array, Array, Array]:
-        return v.x, v.y, rays.sign * v.z - rays.shear_x * v.x - rays.shear_y * v.y
-
     if coordinates is not None:
-        count = coordinates.shape[0] // 3
-        axes = (rays.axis_x, rays.axis_y, rays.axis_z)
-        where = [axis * count + point for point in ids for axis in axes]
-        bars = [i * g + o * h for i, o in shares for g, h in zip(in_space(q), in_space(p))]
-        coordinates = coordinates.at[jnp.concatenate(where)].add(jnp.concatenate(bars))
-    if by_rays is not None:
-        origin = tuple(-(g + h) for g, h in zip(in_space(q), in_space(p), strict=True))
-        shear_x = -rays.sign * (q.x * enter.z + p.x * leave.z)
-        shear_y = -rays.sign * (q.y * enter.z + p.y * leave.z)
-        change = (*origin, shear_x, shear_y, stretch_bar)
-        by_rays = tuple(g + c for g, c in zip(by_rays, change, strict=True))
-    return (values, coordinates), by_rays
+        coordinates = _to_points(coordinates, rays, ids, shares, q, p)
+    return (values, coordinates), _to_rays(by_rays, rays, (q, enter), (p, leave), stretch_bar)
+
+
+def _in_space(rays: ShearedRays, v: _Pulled) -> tuple[Array, Array, Array]:
+    return v.x, v.y, rays.sign * v.z - rays.shear_x * v.x - rays.shear_y * v.y
+
+
+def _to_points(coordinates: Array, rays: ShearedRays, ids: Array, shares: Any, q, p) -> Array:
+    """Adds what points ids (C, R) get: their shares of q and of p."""
+    count = coordinates.shape[0] // 3
+    axes = (rays.axis_x, rays.axis_y, rays.axis_z)
+    where = [axis * count + point for point in ids for axis in axes]
+    q, p = _in_space(rays, q), _in_space(rays, p)
+    bars = [i * g + o * h for i, o in shares for g, h in zip(q, p)]
+    return coordinates.at[jnp.concatenate(where)].add(jnp.concatenate(bars))
+
+
+def _to_rays(by_rays: Any, rays: ShearedRays, first: Any, second: Any, stretch_bar: Array) -> Any:
+    """Adds what the ray gets of two crossings, each with what was pulled back to its face."""
+    if by_rays is None:
+        return None
+    (q, enter), (p, leave) = first, second
+    in_space = zip(_in_space(rays, q), _in_space(rays, p), strict=True)
+    origin = tuple(-(g + h) for g, h in in_space)
+    shear_x = -rays.sign * (q.x * enter.z + p.x * leave.z)
+    shear_y = -rays.sign * (q.y * enter.z + p.y * leave.z)
+    change = (*origin, shear_x, shear_y, stretch_bar)
+    return tuple(g + c for g, c in zip(by_rays, change, strict=True))
+
+
+def pull_back_pair(
+    scene: Scene,
+    rays: ShearedRays,
+    words: tuple[Array, Array],
+    live: Array,
+    cotangent: Segment,
+    gradient: Any,
+) -> Any:
+    """The same for segments between any two faces.
+
+    Args:
+      words: packed cell and corner (R,) of the face at the nearer and at the farther end.
+      live (R,): rays that have a segment. cotangent: of `segment_between`.
+    """
+    (values, coordinates), by_rays = gradient
+    wanted = jnp.any(live)
+    ends = [_end(scene, rays, jnp.where(live, word, 0), wanted) for word in words]
+
+    def pull_back_segment(near: Crossing, far: Crossing, stretch: Array, bar: Segment):
+        return jax.vjp(segment_between, near, far, stretch)[1](bar)
+
+    cotangent = Segment(*(jnp.where(live, g, 0) for g in cotangent))
+    near_bar, far_bar, stretch_bar = stage(
+        wanted, pull_back_segment, ends[0].at, ends[1].at, rays.stretch, cotangent
+    )
+    pulled = [
+        stage(wanted, _pull_back_crossing, end.face, end.area, bar.z, bar.value)
+        for end, bar in zip(ends, (near_bar, far_bar), strict=True)
+    ]
+    for end, q in zip(ends, pulled, strict=True):
+        if values is not None:
+            slots = value_slots(scene, end.cell[None], end.corners, end.ids)
+            values = values.at[slots].add(end.share * q.s[None])
+        if coordinates is not None:
+            none = _Pulled(*(jnp.zeros_like(x) for x in q))
+            shares = [(share, jnp.zeros_like(share)) for share in end.share]
+            coordinates = _to_points(coordinates, rays, end.ids, shares, q, none)
+    both = zip(pulled, (end.at for end in ends), strict=True)
+    return (values, coordinates), _to_rays(by_rays, rays, *both, stretch_bar)
+
+
+class _End(NamedTuple):
+    """cell (R,), corners (3, R) and point ids (3, R) of a face; its vertices, the barycentric
+    coordinates (3, R), signed area (R,) and crossing of the ray."""
+
+    cell: Array
+    corners: Array
+    ids: Array
+    face: Face
+    share: Array
+    area: Array
+    at: Crossing
+
+
+def _end(scene: Scene, rays: ShearedRays, word: Array, wanted: Array) -> _End:
+    cell = packing.cell_of(word)
+    corners = entry_corners(packing.corner_of(word))
+    a, b, c = fetch(scene, rays, cell, corners, wanted)
+    areas = stage(wanted, opposite_edges, a, b, c)
+    sizes = sizes_of(areas)
+    share, at = stage(wanted, _crossed, (a, b, c), sizes, rays.eye)
+    area = jnp.where(is_positive(areas[2]), sum_of(sizes), -sum_of(sizes))
+    return _End(cell, corners, points_at(scene, cell, corners, wanted), (a, b, c), share, area, at)

@@ -42,8 +42,11 @@ from jaxvr.trace.base import AbstractTracer
 from jaxvr.trace.entry import Boxes, Entries, build_boxes, no_entries, search
 from jaxvr.trace.face import Face, choose, crossing, is_positive, opposite_edges, sizes_of
 from jaxvr.trace.local import (
+    as_rays,
+    as_scene,
     edges_to_apex,
     exit_face,
+    gradient_zeros,
     in_order,
     leave_by,
     make_segment,
@@ -128,6 +131,13 @@ class RayCast(AbstractTracer):
     in a face's plane, and through segments of no length.
     """
 
+    def reversed(self):
+        raise ValueError(
+            "RayCast walks from the eye, so it cannot give the farthest segments first as "
+            "compositing back to front wants them. Use shade(trace(volume, camera), ...), which "
+            "plays segments in either direction, or tracer=KBuffer(); or composite front to back."
+        )
+
     def prepare(self, volume: TetMesh) -> CastScene:
         scene = make_scene(volume)
         return CastScene(scene, build_boxes(scene))
@@ -175,40 +185,18 @@ class RayCast(AbstractTracer):
             return _cross(scene.mesh, rays, state, moved, enter)
 
     def gradient_start(self, scene, rays, perturbed):
-        mesh, by_rays = perturbed[0].mesh, any(jax.tree.leaves(perturbed[1]))
-        for_scene = (
-            jnp.zeros_like(scene.mesh.values) if mesh.values else None,
-            jnp.zeros_like(scene.mesh.coordinates) if mesh.coordinates else None,
-        )
-        return for_scene, (jnp.zeros_like(rays.origin_x),) * 6 if by_rays else None
+        by_rays = any(jax.tree.leaves(perturbed[1]))
+        return gradient_zeros(scene.mesh, rays, perturbed[0].mesh, by_rays)
 
     def pull_back(self, scene, rays, state, cotangent, gradient):
         return pull_back_cell(scene.mesh, rays, state, cotangent, gradient)
 
     def scene_cotangent(self, scene, gradient):
-        values, coordinates = gradient
         zero = jax.tree.map(jnp.zeros_like, scene)
-        mesh = zero.mesh
-        if values is not None:
-            mesh = dataclasses.replace(mesh, values=values)
-        if coordinates is not None:
-            mesh = dataclasses.replace(mesh, coordinates=coordinates)
-        return dataclasses.replace(zero, mesh=mesh)
+        return dataclasses.replace(zero, mesh=as_scene(scene.mesh, gradient))
 
     def rays_cotangent(self, rays, gradient):
-        zero = jax.tree.map(jnp.zeros_like, rays)
-        if gradient is None:
-            return zero
-        o_x, o_y, o_z, s_x, s_y, stretch = gradient
-        return dataclasses.replace(
-            zero,
-            origin_x=o_x,
-            origin_y=o_y,
-            origin_z=o_z,
-            shear_x=s_x,
-            shear_y=s_y,
-            stretch=stretch,
-        )
+        return as_rays(rays, gradient)
 
 
 class _Door(NamedTuple):

@@ -5,6 +5,9 @@ flat arrays: node i has a scalar and the length of the piece that leads to it fr
 the scalar jumps, and where a ray (re-)enters the mesh, a node of length 0 carries the new scalar.
 So a segment takes 8 bytes in float32 (16 in float64), plus 8 for each jump and 4 for each ray.
 Nothing is split at control points, since those belong to the transfer function.
+
+From behind, a ray's nodes are played from its last down to the second: node i leads to node i - 1,
+by the same length, and a node of length 0 stays where it is; the next starts anew.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core.pytree import pytree, static
-from jaxvr.optics.partition import Segment
+from jaxvr.optics.partition import Segment, turned
 from jaxvr.trace.base import AbstractTracer
 
 Array = jax.Array
@@ -76,7 +79,15 @@ class PlayState(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Recorded(AbstractTracer):
-    """Plays back `Segments`. Gradients: with respect to their scalars and lengths."""
+    """Plays back `Segments`. Gradients: with respect to their scalars and lengths.
+
+    reverse: from behind; an `Over` that composites back to front sets it.
+    """
+
+    reverse: bool = False
+
+    def reversed(self) -> Recorded:
+        return Recorded(not self.reverse)
 
     def prepare(self, volume: Segments) -> Nodes:
         return Nodes(volume.scalar, volume.length)
@@ -91,11 +102,12 @@ class Recorded(AbstractTracer):
     def start(self, scene: Nodes, rays: Runs) -> PlayState:
         zero = jnp.zeros(rays.first.shape, scene.scalar.dtype)
         no = jnp.zeros(rays.first.shape, bool)
-        return PlayState(
-            rays.first, Segment(zero, zero, zero), no, ~no, no, jnp.zeros_like(rays.first)
-        )
+        node = rays.end if self.reverse else rays.first
+        return PlayState(node, Segment(zero, zero, zero), no, ~no, no, jnp.zeros_like(rays.first))
 
     def step(self, scene: Nodes, rays: Runs, state: PlayState, move: Array) -> PlayState:
+        if self.reverse:
+            return _step_back(scene, rays, state, move)
         move = (move & state.active) | state.waiting
         first = move & state.waiting
         node = jnp.where(move, state.node + 1, state.node)
@@ -121,6 +133,8 @@ class Recorded(AbstractTracer):
     def pull_back(self, scene, rays, state, cotangent, gradient):
         (scalar, length), _ = gradient
         live = state.active
+        if self.reverse:
+            cotangent = turned(cotangent)
         if scalar is not None:
             # A jump takes its front from its own node.
             before = jnp.where(state.segment.length == 0, 0, 1)
@@ -137,6 +151,22 @@ class Recorded(AbstractTracer):
 
     def rays_cotangent(self, rays, gradient):
         return rays
+
+
+def _step_back(scene: Nodes, rays: Runs, state: PlayState, move: Array) -> PlayState:
+    """`Recorded.step` from behind."""
+    move = (move & state.active) | state.waiting
+    node = jnp.where(move, state.node - 1, state.node)
+    active = jnp.where(move, node > rays.first, state.active)
+    at = jnp.maximum(node, 0)
+    length = jnp.where(active, scene.length[at], 0)
+    front = scene.scalar[at]
+    # The ends of a jump are both its own scalar, so a jump starts where the one before ended, and
+    # what follows it does not. Nor does the first segment, which follows a length of 0 too.
+    back = jnp.where(length == 0, front, scene.scalar[jnp.maximum(at - 1, 0)])
+    fresh = move & active & (state.segment.length == 0)
+    no = jnp.zeros_like(move)
+    return PlayState(node, Segment(front, back, length), active, no, fresh, state.status)
 
 
 def record(tracer: AbstractTracer, scene: Any, rays: Any) -> tuple[Array, Array]:

@@ -55,9 +55,7 @@ class Scene:
 
 def make_scene(mesh: TetMesh) -> Scene:
     points = merged_points(mesh)
-    largest = jnp.max(jnp.abs(lax.stop_gradient(points)))
-    exponent = jnp.where(largest > 0, -jnp.frexp(jnp.where(largest > 0, largest, 1))[1], 0)
-    scale = jnp.ldexp(jnp.ones((), points.dtype), exponent)
+    scale = scale_of(points)
     count = mesh.boundary.shape[0]
     leaves = 1 << max(count - 1, 1).bit_length()
     faces = jnp.concatenate([mesh.boundary, jnp.full(leaves - count, -1, jnp.int32)])
@@ -75,6 +73,13 @@ def make_scene(mesh: TetMesh) -> Scene:
         location=mesh.location,
         seams=mesh.duplicates.shape[0] > 0,
     )
+
+
+def scale_of(points: Array) -> Array:
+    """The power of two () that brings the largest coordinate of points (P, 3) to [1/2, 1)."""
+    largest = jnp.max(jnp.abs(lax.stop_gradient(points)))
+    exponent = jnp.where(largest > 0, -jnp.frexp(jnp.where(largest > 0, largest, 1))[1], 0)
+    return jnp.ldexp(jnp.ones((), points.dtype), exponent)
 
 
 def merged_points(mesh: TetMesh) -> Array:

@@ -27,6 +27,7 @@ from .mesh import TetMesh
 from .plot3d import read_plot3d
 from .quality import Quality, quality
 from .readers import Field, list_fields, read_mesh, write_mesh
+from .refine import delaunay_deviation, refine
 from .report import MeshReport
 
 __all__ = [
@@ -35,9 +36,11 @@ __all__ = [
     "Quality",
     "TetMesh",
     "datasets",
+    "delaunay_deviation",
     "list_fields",
     "quality",
     "read_mesh",
     "read_plot3d",
+    "refine",
     "write_mesh",
 ]

@@ -123,6 +123,7 @@ class Witness:
 
     over: Over
     seen: list = dataclasses.field(default_factory=list, compare=False)
+    backwards = False
 
     def start(self, rays, dtype):
         return self.over.start(rays, dtype)

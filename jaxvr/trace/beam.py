@@ -1,0 +1,175 @@
+"""A batch of rays as one beam: what of the mesh it may meet, and where its rays stand in it.
+
+Rays that share an origin (a tile of a pinhole camera's image) or a direction (of an orthographic
+one) are points (x, y) of a plane across them. In the beam's own axes, with z along its middle, a
+vertex is seen at
+
+    pinhole:  (X, Y) / W = (q_x, q_y) / q_z        parallel:  W = 1
+
+with q from the origin. A line meets a triangle where it passes its three edges on the same side,
+
+    E_ij(x, y) = (x_j - x_i) (y - y_i) - (y_j - y_i) (x - x_i).
+
+That rounds, so it serves to find which rays *may* meet a face: a vertex is seen within d of where
+it is, which changes E by at most about 2 d (size of the face) for rays that meet it, and within a
+bound of that E counts as zero. Which rays do meet the face is decided by exact signs
+(`trace.face`). A face of which part is beside the eye or behind it has no such image; any ray may
+meet it. So may rays that share neither origin nor direction, which is slow and right.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+Array = jax.Array
+
+# Units in the last place by which a point's image may be off: of a difference, a scalar product and
+# a quotient, and as much again for the ray's own.
+ROUNDINGS = 4
+
+
+class Beam(NamedTuple):
+    """R rays. All floats are constants to derivatives.
+
+    origin (3,): of the first ray, in the scene's units. axes (3, 3): rows x, y, z.
+    pinhole (): whether rays come from one point; else W = 1. narrow (): whether (x, y) mean
+    anything. place (2, R): x and y of each ray. low, high (2,): bounds of them.
+    """
+
+    origin: Array
+    axes: Array
+    pinhole: Array
+    narrow: Array
+    place: Array
+    low: Array
+    high: Array
+
+
+def beam_of(origins: Array, directions: Array) -> Beam:
+    """The beam of rays (3, R) in the scene's units, where coordinates are below 1 in size."""
+    origins, directions = lax.stop_gradient((origins, directions))
+    origin, direction = origins[:, :1], directions[:, :1]
+    parallel = jnp.all(directions == direction)
+    pinhole = jnp.all(origins == origin) & ~parallel
+    size = jnp.max(jnp.abs(directions), axis=0)
+    unit = directions / size[None]
+    unit = unit / jnp.sqrt(jnp.sum(unit * unit, axis=0))[None]
+    forward = _unit(jnp.sum(unit, axis=1))
+    across = jnp.zeros_like(forward).at[jnp.argmin(jnp.abs(forward))].set(1)
+    right = _unit(jnp.cross(forward, across))
+    axes = jnp.stack([right, jnp.cross(right, forward), forward])
+    ahead = _apply(axes, unit)
+    # A beam as wide as half a turn has no plane across it.
+    narrow = parallel | (pinhole & jnp.all(ahead[2] > 0.1))
+    deep = jnp.where(narrow & pinhole, ahead[2], 1)
+    place = jnp.where(pinhole, ahead[:2] / deep[None], _apply(axes, origins - origin)[:2])
+    return Beam(origin[:, 0], axes, pinhole, narrow, place, place.min(1), place.max(1))
+
+
+def _unit(v: Array) -> Array:
+    size = jnp.sqrt(jnp.sum(v * v))
+    # Directions that cancel have no mean; then the beam is not narrow, and any axis will do.
+    axis = jnp.zeros_like(v).at[2].set(1)
+    return jnp.where(size > 0, v / jnp.where(size > 0, size, 1), axis)
+
+
+def _apply(axes: Array, points: Array) -> Array:
+    """axes (N, 3) times points (3, ...), term by term: a matrix product may round more."""
+    x, y, z = points
+    return jnp.stack([a[0] * x + a[1] * y + a[2] * z for a in axes])
+
+
+def sides(beam: Beam) -> tuple[Array, Array, Array]:
+    """Half spaces (4,) round the beam: n . q + c >= 0 for all q from the origin that its rays meet
+    ahead of them, with normals n (4, 3) and c (4,); and the slack (4,) for each unit of |q|."""
+    right, up, forward = beam.axes
+    zero = jnp.zeros((), right.dtype)
+    normals, offsets = [], []
+    for axis, bound, sign in ((right, 0, 1), (right, 0, -1), (up, 1, 1), (up, 1, -1)):
+        at = (beam.low if sign > 0 else beam.high)[bound]
+        normals.append(sign * jnp.where(beam.pinhole, axis - at * forward, axis))
+        offsets.append(jnp.where(beam.pinhole, zero, -sign * at))
+    reach = 1 + jnp.max(jnp.abs(beam.place))
+    slack = jnp.full(4, 2 * ROUNDINGS * jnp.finfo(right.dtype).eps) * reach
+    return jnp.stack(normals), jnp.stack(offsets), slack
+
+
+def meets_boxes(beam: Beam, low: Array, high: Array) -> Array:
+    """Whether the beam may meet boxes with corners (3, N): never a wrong no."""
+    normals, offsets, slack = sides(beam)
+    middle, half = 0.5 * (low + high) - beam.origin[:, None], 0.5 * (high - low)
+    size = jnp.sum(jnp.abs(middle) + half, axis=0)
+    met = jnp.ones(low.shape[1:], bool)
+    for normal, offset, margin in zip(normals, offsets, slack, strict=True):
+        farthest = offset + sum(
+            n * m + jnp.abs(n) * h for n, m, h in zip(normal, middle, half, strict=True)
+        )
+        met = met & (farthest >= -margin * (1 + size))
+    return met | ~beam.narrow
+
+
+def outside(beam: Beam, q: Array) -> Array:
+    """On which sides (4, ...) of the beam points q (3, ...), from its origin, surely lie."""
+    normals, offsets, slack = sides(beam)
+    x, y, z = q
+    size = jnp.abs(x) + jnp.abs(y) + jnp.abs(z)
+    out = [
+        n[0] * x + n[1] * y + n[2] * z + offset < -margin * (1 + size)
+        for n, offset, margin in zip(normals, offsets, slack, strict=True)
+    ]
+    return jnp.stack(out) & beam.narrow
+
+
+class Outline(NamedTuple):
+    """Faces (N,) as the beam sees them: coefficients (3, N) of the three edge functions a x + b y +
+    c, in units of what is taken for zero."""
+
+    a: Array
+    b: Array
+    c: Array
+
+
+def outline(beam: Beam, corners: tuple[Array, Array, Array], live: Array) -> Outline:
+    """Outlines of faces with corners (3, N) each, from the beam's origin. No ray may meet faces
+    that are not in `live` (N,)."""
+    eps = jnp.finfo(corners[0].dtype).eps
+    x, y, blur, ahead = [], [], [], live & beam.narrow
+    reach = 1 + jnp.max(jnp.abs(beam.place))
+    for corner in corners:
+        right, up, depth = _apply(beam.axes, corner)
+        size = jnp.sum(jnp.abs(corner), axis=0)
+        w = jnp.where(beam.pinhole, depth, 1)
+        near = w > 1e-3 * size  # or its image is too far off to be of use
+        ahead = ahead & (near | ~beam.pinhole)
+        w = jnp.where(near, w, 1)
+        x.append(right / w)
+        y.append(up / w)
+        wide = reach + jnp.abs(right / w) + jnp.abs(up / w)
+        blur.append(ROUNDINGS * eps * (size / w + 1) * wide)
+    d = jnp.maximum(jnp.maximum(blur[0], blur[1]), blur[2])
+    rows = []
+    for i, j in ((1, 2), (2, 0), (0, 1)):
+        to_x, to_y = x[j] - x[i], y[j] - y[i]
+        length = jnp.abs(to_x) + jnp.abs(to_y)
+        slack = 4 * d * (length + d) + 4 * eps * (jnp.abs(to_x * y[i]) + jnp.abs(to_y * x[i]))
+        rows.append((-to_y, to_x, to_y * x[i] - to_x * y[i], slack))
+    a, b, c, slack = (jnp.stack(r) for r in zip(*rows, strict=True))
+    size = jnp.stack(x).max(0) - jnp.stack(x).min(0) + jnp.stack(y).max(0) - jnp.stack(y).min(0)
+    slack = slack + 4 * d[None] * size[None]
+    # Without an image all three are zero; where nothing is to be met, their signs differ.
+    a, b, c = (jnp.where(ahead[None], row / slack, 0) for row in (a, b, c))
+    never = jnp.array([2, -2, 0], c.dtype)[:, None]
+    return Outline(a, b, jnp.where(live[None], c, never))
+
+
+def may_meet(face: Outline, place: Array) -> Array:
+    """Whether rays at place (2, 1, R) may meet faces (N, 1): (N, R)."""
+    x, y = place
+    e = [a * x + b * y + c for a, b, c in zip(face.a, face.b, face.c, strict=True)]
+    left = jnp.minimum(jnp.minimum(e[0], e[1]), e[2]) >= -1
+    right = jnp.maximum(jnp.maximum(e[0], e[1]), e[2]) <= 1
+    return left | right

@@ -1,0 +1,84 @@
+"""The faces of a mesh, each once, without a table of them.
+
+Slot 4 c + k is the face of cell c opposite its local vertex k. A face between two cells belongs to
+the cell of the lower number; the other's slot is empty. So nothing is stored that the mesh does not
+have, and boxes round blocks of cells are all that is computed beforehand.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxvr._core.gather import take
+from jaxvr._core.pytree import pytree
+from jaxvr.trace.scene import Scene, entry_corners
+from jaxvr.trace.stream import BLOCK
+from jaxvr.volume import packing
+
+Array = jax.Array
+
+CELLS = BLOCK // 4
+
+
+@pytree
+class CellFaces:
+    """A `FaceSource` over a scene. boxes: low and high corners (3, blocks)."""
+
+    scene: Scene
+    boxes: tuple[Array, Array]
+
+    @property
+    def vertices(self) -> Array:
+        return self.scene.vertices
+
+    def look(self, blocks: Array) -> tuple[Array, tuple[Array, Array, Array], Array]:
+        count = self.scene.cells.shape[0] // 4
+        cell = (blocks[:, None] * CELLS + jnp.arange(CELLS, dtype=jnp.int32)[None]).reshape(-1)
+        there, cell = cell < count, jnp.minimum(cell, count - 1)
+        # One row for each local vertex, and for the face opposite it.
+        slot = 4 * cell[None] + jnp.arange(4, dtype=jnp.int32)[:, None]
+        word = take(self.scene.neighbors, slot)
+        mine = (word < 0) | (packing.cell_of(word) > cell[None])
+        ids = take(self.scene.cells, slot)
+        points = jnp.stack([take(self.scene.vertices, 4 * ids + axis) for axis in range(3)])
+        faces = [[j for j in range(4) if j != k] for k in range(4)]
+        a, b, c = (
+            jnp.concatenate([points[:, face[i]] for face in faces], axis=1) for i in range(3)
+        )
+        return slot.reshape(-1), (a, b, c), (there[None] & mine).reshape(-1)
+
+    def corners(self, slot: Array) -> Array:
+        cell, corner = slot // 4, slot % 4
+        return take(self.scene.cells, 4 * cell[None] + entry_corners(corner))
+
+    def keep(self, origin: Array, slot: Array) -> Array:
+        """The faces of cells that may contain the eye: a segment that starts there needs its cell's
+        other end too, behind the eye."""
+        low, high = self.boxes
+        near = jnp.all((origin >= low.min(1)) & (origin <= high.max(1)))
+
+        def inside(slot):
+            word = take(self.scene.neighbors, slot)
+            behind = jnp.where(word < 0, slot // 4, packing.cell_of(word))
+            return self._round(origin, slot // 4) | self._round(origin, behind)
+
+        return lax.cond(near, inside, lambda slot: jnp.zeros(slot.shape, bool), slot)
+
+    def _round(self, origin: Array, cell: Array) -> Array:
+        """Whether the boxes of cells (N,) contain a point (3,)."""
+        ids = take(self.scene.cells, 4 * cell[None] + jnp.arange(4, dtype=jnp.int32)[:, None])
+        points = jnp.stack([take(self.scene.vertices, 4 * ids + axis) for axis in range(3)])
+        eye = origin[:, None]
+        return jnp.all((points.min(1) <= eye) & (points.max(1) >= eye), axis=0)
+
+
+def cell_faces(scene: Scene) -> CellFaces:
+    cells = scene.cells.shape[0] // 4
+    blocks = -(-cells // CELLS)
+    number = jnp.minimum(jnp.arange(blocks * CELLS), cells - 1)  # the last block is filled up
+    ids = take(scene.cells.reshape(-1, 4), number)
+    count = scene.coordinates.shape[0] // 3
+    points = lax.stop_gradient(scene.coordinates).reshape(3, count)[:, ids.reshape(blocks, -1)]
+    return CellFaces(scene, (points.min(2), points.max(2)))

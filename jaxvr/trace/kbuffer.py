@@ -1,0 +1,461 @@
+"""Hardware-assisted visibility sorting (Callahan, Ikits, Comba and Silva 2005), as a scan.
+
+Faces are rasterised in an order that is nearly right (`jaxvr.order`, `trace.stream`), and each
+pixel puts its fragments right in a buffer of k entries. A fragment that arrives at a full buffer
+dislodges the closest of the k + 1, and the closest two are the ends of a segment (section 3.2 and
+Figure 3). Entries are kept unsorted, as in section 4: the closest is found by a minimum over them.
+At first the buffer only fills; at the end it is emptied without anything arriving.
+
+Which two. The paper takes the closest two, and needs two tags, since not all that lies between two
+fragments is inside of the mesh (section 4): whether a fragment is on the boundary, and whether the
+pixel is inside or outside. Behind a boundary fragment that ends a segment it is outside; the next
+two are then no segment, and it is inside again. That is right if fragments come out sorted and the
+boundary does not touch itself (`pairs="closest"`). Here fragments also know the two cells that
+their face lies between, -1 for outside, which carries the same tags and more: the segment of a cell
+is between its two fragments (`pairs="cells"`, the default). A cell belongs to each pair of
+neighbours in a sorted list, so that the two ways agree where the paper's is right; by cells it is
+right too where boundaries touch and roundings decide who is first, where the mesh overlaps itself,
+and where a cell is inverted. And it is known whether every cell that a ray crossed got its segment.
+
+What a k that is too small does. A fragment whose partner has not arrived leaves the buffer without
+one, and the segment is missing. That is seen, and sets the status `K_TOO_SMALL` of the ray, as does
+a fragment that arrives behind its turn. A ray without it has every segment, in order. How many
+entries an image needs is what `measure_k` tells.
+
+Floats are those of `RayCast`, from the same vertices by the same arithmetic.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxvr._core import status as bits
+from jaxvr._core.gather import load, take
+from jaxvr._core.stage import stage
+from jaxvr.optics.partition import Segment
+from jaxvr.order import AbstractOrder, Centroid
+from jaxvr.trace.base import AbstractTracer
+from jaxvr.trace.face import Crossing, barycentric
+from jaxvr.trace.faces import CellFaces, cell_faces
+from jaxvr.trace.local import (
+    as_rays,
+    as_scene,
+    gradient_zeros,
+    pull_back_pair,
+    segment_between,
+)
+from jaxvr.trace.scene import Scene, entry_corners, longest_edge, make_scene, values_at
+from jaxvr.trace.stream import (
+    BeamRays,
+    Fragments,
+    Sort,
+    Stream,
+    beam_rays,
+    drawn,
+    next_fragments,
+    over,
+    refill,
+    start_stream,
+)
+from jaxvr.volume import packing
+
+Array = jax.Array
+
+
+class Entry(NamedTuple):
+    """Fragments, (..., R) each; a buffer has k + 1 of them a ray, (..., k + 1, R).
+
+    depth (2, ...): a pair, from the eye; times -1 where the farthest comes first; infinite where
+    there is no fragment. values (V, ...): the scalar in each of the two cells that the face lies
+    between, or one for both. words (2, ...) int32: packed cell and corner of the face in each, -1
+    where there is none or where the segment in it has been given.
+    """
+
+    depth: Array
+    values: Array
+    words: Array
+
+
+class BufferState(NamedTuple):
+    """One state of R rays.
+
+    buffer: the last entry is the place of the fragment that arrives. count (R,): entries in use.
+    outside (R,): the paper's tag of a pixel. reach (R,): depth before which nothing may arrive any
+    more. owed: a cell (R,) that lacks a fragment, -1 if none does, and the depth (R,) of its other.
+    ends: words (R,) of the segment's faces, the nearer one first. begun (R,): had a segment.
+    """
+
+    stream: Stream
+    buffer: Entry
+    count: Array
+    outside: Array
+    reach: Array
+    owed: tuple[Array, Array]
+    ends: tuple[Array, Array]
+    begun: Array
+    segment: Segment
+    active: Array
+    waiting: Array
+    fresh: Array
+    status: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class KBuffer(AbstractTracer):
+    """Faces sorted roughly, fragments sorted by a buffer of k entries a pixel (see the module).
+
+    k: entries. A ray that would have needed more has the status `K_TOO_SMALL`, an error outside
+    jit; `render(..., status=True)` gives the image and the status instead, and `measure_k` the k
+    that a view needs. Time grows with it.
+    order: a `jaxvr.order.AbstractOrder`; the better it sorts, the smaller k may be.
+    pairs: "cells" or "closest", which two fragments make a segment; "closest" is the paper's.
+    reverse: the farthest segments first; an `Over` that composites back to front sets it.
+
+    Equal to `RayCast` where k suffices, gradients too. Where a mesh overlaps itself, segments come
+    by the depth of their nearer ends, while `RayCast` takes whole paths; the rings of cells that it
+    misses there are found here.
+
+    Rays that share an origin (pinhole) or a direction (orthographic) with their batch are fast; any
+    others are tested against every face.
+
+    Raises:
+      ValueError: if k is not a positive integer, or order or pairs are not what they may be.
+    """
+
+    k: int = 6
+    order: AbstractOrder = Centroid()
+    pairs: Literal["cells", "closest"] = "cells"
+    reverse: bool = False
+
+    def __post_init__(self):
+        if not isinstance(self.k, int) or self.k < 1:
+            raise ValueError(f"k must be a positive integer, but is {self.k!r}.")
+        if not isinstance(self.order, AbstractOrder):
+            raise ValueError(
+                "order must be an order of faces, such as jaxvr.order.Centroid(), but is "
+                f"{self.order!r}."
+            )
+        if self.pairs not in ("cells", "closest"):
+            raise ValueError(f'pairs must be "cells" or "closest", but is {self.pairs!r}.')
+
+    def reversed(self) -> KBuffer:
+        return dataclasses.replace(self, reverse=not self.reverse)
+
+    def prepare(self, volume: Any) -> CellFaces:
+        return cell_faces(make_scene(volume))
+
+    def longest(self, scene: CellFaces) -> Array:
+        return longest_edge(scene.scene)
+
+    def prepare_rays(self, scene: CellFaces, origins: Array, directions: Array) -> BeamRays:
+        return beam_rays(origins, directions, scene.scene.scale)
+
+    def start(self, scene: CellFaces, rays: BeamRays) -> BufferState:
+        dtype, count = rays.origins.dtype, rays.origins.shape[1]
+        zero, no = jnp.zeros(count, dtype), jnp.zeros(count, bool)
+        integer, rows = jnp.zeros(count, jnp.int32), (self.k + 1, count)
+        values = 1 if one_value(scene.scene) else 2
+        return BufferState(
+            stream=start_stream(scene, count),
+            buffer=Entry(
+                jnp.stack([jnp.full(rows, jnp.inf, dtype), jnp.zeros(rows, dtype)]),
+                jnp.zeros((values, *rows), dtype),
+                jnp.full((2, *rows), -1, jnp.int32),
+            ),
+            count=integer,
+            outside=no,
+            reach=zero - jnp.inf,
+            owed=(integer - 1, zero),
+            ends=(integer, integer),
+            begun=no,
+            segment=Segment(zero, zero, zero),
+            active=no,
+            waiting=~no,
+            fresh=no,
+            status=integer,
+        )
+
+    def step(self, scene: CellFaces, rays: BeamRays, state: BufferState, move: Array):
+        with jax.named_scope("kbuffer_step"):
+            alive = state.active | state.waiting
+            go = (move & state.active) | state.waiting
+            sort = Sort(self.order, self.reverse)
+            stream, more = state.stream, ~over(state.stream)
+            idle = drawn(stream) | ~alive
+            stream = refill(stream, more & jnp.all(idle) & jnp.any(alive), scene, rays, sort)
+            # A ray whose place for an arrival is taken has another segment to give first.
+            free = jnp.isinf(state.buffer.depth[0, -1])
+            stream, new = next_fragments(stream, scene, rays.sheared, go & free)
+            done = go & over(stream) & drawn(stream)
+            state = state._replace(stream=stream)
+            entry = _entry(scene.scene, rays, new, self)
+            return _give(rays, _arrive(rays, state, new.hit, entry, self), go, done, self)
+
+    def gradient_start(self, scene, rays, perturbed):
+        by_rays = any(jax.tree.leaves(perturbed[1]))
+        return gradient_zeros(scene.scene, rays.sheared, perturbed[0].scene, by_rays)
+
+    def pull_back(self, scene, rays, state, cotangent, gradient):
+        if self.reverse:
+            cotangent = cotangent._replace(front=cotangent.back, back=cotangent.front)
+        return pull_back_pair(
+            scene.scene, rays.sheared, state.ends, state.active, cotangent, gradient
+        )
+
+    def scene_cotangent(self, scene, gradient):
+        zero = jax.tree.map(jnp.zeros_like, scene)
+        return dataclasses.replace(zero, scene=as_scene(scene.scene, gradient))
+
+    def rays_cotangent(self, rays, gradient):
+        zero = jax.tree.map(jnp.zeros_like, rays)
+        return dataclasses.replace(zero, sheared=as_rays(rays.sheared, gradient))
+
+
+def one_value(scene: Scene) -> bool:
+    """Whether the scalar is the same on both sides of every face."""
+    return scene.continuous and not scene.seams
+
+
+def _entry(scene: Scene, rays: BeamRays, new: Fragments, how: KBuffer) -> Entry:
+    """Fragments as entries of a buffer."""
+
+    def find(neighbors, slot):
+        return take(neighbors, slot)
+
+    wanted = jnp.any(new.hit)
+    across = load(wanted, find, scene.neighbors, new.slot)
+    # The turned and the seam bits are dropped.
+    across = jnp.where(
+        across < 0, -1, packing.pack(packing.cell_of(across), packing.corner_of(across))
+    )
+    words = jnp.stack([packing.pack(new.slot // 4, new.slot % 4), across])
+    values = new.at.value[None] if one_value(scene) else _values(scene, words, new, wanted)
+    depth = jnp.stack([new.at.z, new.at.z_low])
+    return Entry(-depth if how.reverse else depth, values, words)
+
+
+def _values(scene: Scene, words: Array, new: Fragments, wanted: Array) -> Array:
+    """The scalar (2, R) at fragments, as each of the two cells has it."""
+    _, of_b, of_c = barycentric(new.face, new.weights)
+    out = []
+    for word in words:
+        known = jnp.maximum(word, 0)
+        corners = entry_corners(packing.corner_of(known))
+        a, b, c = values_at(scene, packing.cell_of(known), corners, wanted)
+        out.append(a + (of_b * (b - a) + of_c * (c - a)))
+    return jnp.stack(out)
+
+
+def _tolerance(depth: Array, rays: BeamRays) -> Array:
+    """What rounding may do to a depth (R,)."""
+    eps = jnp.finfo(depth.dtype).eps
+    return 16 * eps * (jnp.abs(depth) + jnp.abs(lax.stop_gradient(rays.sheared.eye)))
+
+
+def _arrive(rays: BeamRays, state: BufferState, hit: Array, new: Entry, how: KBuffer):
+    """Fragments (R,) that were hit take the last entry."""
+    depth = lax.stop_gradient(new.depth[0])
+    seen = depth <= 0 if how.reverse else depth >= 0
+    late = hit & seen & (depth < state.reach - _tolerance(depth, rays))
+    buffer = jax.tree.map(
+        lambda rows, x: rows.at[..., -1, :].set(jnp.where(hit, x, rows[..., -1, :])),
+        state.buffer,
+        new,
+    )
+    status = state.status | jnp.where(late, bits.K_TOO_SMALL, 0).astype(jnp.int32)
+    return state._replace(buffer=buffer, count=state.count + hit.astype(jnp.int32), status=status)
+
+
+class _Pair(NamedTuple):
+    """first, second: entries (R,) of a buffer by number; found (R,): whether there is a second.
+    mine, theirs (R,) int32: which of their two cells the segment is in."""
+
+    first: Array
+    second: Array
+    found: Array
+    mine: Array
+    theirs: Array
+
+
+def _least(depth: Array, valid: Array) -> Array:
+    """Number (R,) of the closest among valid entries (K, R)."""
+    high, low = depth
+    high = jnp.where(valid, high, jnp.inf)
+    tied = high == jnp.min(high, axis=0)[None]
+    return jnp.argmin(jnp.where(tied & valid, low, jnp.inf), axis=0).astype(jnp.int32)
+
+
+def _is(number: Array, size: int) -> Array:
+    """One-hot (K, R)."""
+    return jnp.arange(size, dtype=jnp.int32)[:, None] == number[None]
+
+
+def _pick(number: Array, rows: Array) -> Array:
+    """The entry (..., R) of a number (R,) from rows (..., K, R). By a sum, which is vectorised."""
+    chosen = _is(number, rows.shape[-2])
+    return jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=-2, dtype=rows.dtype)
+
+
+def _choose_pair(depth: Array, words: Array, how: KBuffer) -> _Pair:
+    """The first entry, and the one that makes a segment with it."""
+    used = jnp.isfinite(depth[0])
+    first = _least(depth, used)
+    rest = used & ~_is(first, used.shape[0])
+    # Cells are equal where words are, but for the corner.
+    ours, cells = packing.cell_of(_pick(first, words)), packing.cell_of(words)
+    shared = rest & _know(ours[:, None], cells)
+    second = _least(depth, rest if how.pairs == "closest" else shared)
+    found = jnp.any(rest if how.pairs == "closest" else shared, axis=0)
+    theirs = _pick(second, cells)
+    mine = jnp.where(_know(ours[:1], theirs), 0, 1).astype(jnp.int32)
+    same = jnp.where(mine == 0, ours[0], ours[1])
+    other = jnp.where((theirs[0] == same) & (same >= 0), 0, 1).astype(jnp.int32)
+    if how.pairs == "closest":  # they may have no cell in common: take the last side that exists
+        other = jnp.where(theirs[1] < 0, 0, other)
+        mine = jnp.where(ours[1] < 0, 0, mine)
+    return _Pair(first, second, found, mine, other)
+
+
+def _know(ours: Array, theirs: Array) -> Array:
+    """Whether any of our cells (N, ...) is one of theirs (2, ...)."""
+    known = [(a == b) & (a >= 0) for a in ours for b in theirs]
+    out = known[0]
+    for other in known[1:]:
+        out = out | other
+    return out
+
+
+def _side(which: Array, both: Array) -> Array:
+    """both[which], ray by ray; what all cells share if there is one for both."""
+    return both[0] if both.shape[0] == 1 else jnp.where(which == 0, both[0], both[1])
+
+
+def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuffer):
+    """Full buffers give the segment of their first fragment, and drop it. So do those of rays that
+    are `done`, to which nothing arrives any more, until they are empty."""
+    buffer, count = state.buffer, state.count
+    size = how.k + 1
+    give = go & ((count == size) | (done & (count > 0)))
+    wanted = jnp.any(give)
+    pair = stage(
+        wanted, lambda *x: _choose_pair(*x, how), lax.stop_gradient(buffer.depth), buffer.words
+    )
+    first = jax.tree.map(lambda rows: _pick(pair.first, rows), buffer)
+    second = jax.tree.map(lambda rows: _pick(pair.second, rows), buffer)
+    found = give & pair.found
+    inside, outside = found, state.outside
+    if how.pairs == "closest":
+        # The tags: a segment that ends on the boundary leads outside, and the next two inside.
+        inside = found & ~outside
+        outside = jnp.where(found, inside & (second.words[1] < 0), outside)
+
+    ends = (_side(pair.mine, first.words), _side(pair.theirs, second.words))
+    # Empty entries are infinitely far: guarded here, or 0 times that is the derivative.
+    one, two = (
+        Crossing(*(jnp.where(found, x, 0) for x in _crossing(entry, side)))
+        for entry, side in ((first, pair.mine), (second, pair.theirs))
+    )
+    if how.reverse:
+        one, two = (c._replace(z=-c.z, z_low=-c.z_low) for c in (one, two))
+        segment = segment_between(two, one, rays.sheared.stretch)
+        segment, ends = segment._replace(front=segment.back, back=segment.front), ends[::-1]
+    else:
+        segment = segment_between(one, two, rays.sheared.stretch)
+    given = inside & (segment.length > 0)
+
+    buffer, left, drop = _forget(buffer, first.words, pair, give, found, how)
+    buffer = _settle(buffer, pair.first, drop, go & ~give, count)
+    count = count - drop.astype(jnp.int32)
+    state = _account(rays, state, first, second, left, drop, how)
+    finished = done & (count == 0)
+    owing = finished & (state.owed[0] >= 0)
+
+    # A ray without a segment stands at the end of its last.
+    active = jnp.where(go, given, state.active)
+    back = state.segment.back
+    old = Segment(jnp.where(go, back, state.segment.front), back, state.segment.length)
+    new = Segment(*(jnp.where(given, a, b) for a, b in zip(segment, old, strict=True)))
+    return state._replace(
+        buffer=buffer,
+        count=count,
+        outside=outside,
+        ends=tuple(jnp.where(given, a, b) for a, b in zip(ends, state.ends, strict=True)),
+        begun=state.begun | given,
+        segment=new._replace(length=jnp.where(active, new.length, 0)),
+        active=active,
+        waiting=jnp.where(go, ~given & ~finished, state.waiting),
+        fresh=given & (~state.begun | (segment.front != back)),
+        status=state.status | jnp.where(owing, bits.K_TOO_SMALL, 0).astype(jnp.int32),
+    )
+
+
+def _crossing(entry: Entry, side: Array) -> Crossing:
+    return Crossing(entry.depth[0], entry.depth[1], _side(side, entry.values))
+
+
+def _forget(buffer: Entry, words: Array, pair: _Pair, give: Array, found: Array, how: KBuffer):
+    """Both ends forget the cell of the segment that was given. An end that has another cell to give
+    a segment of stays for it. Returns the buffer, the cells (2, R) that the first entry has left,
+    and which rays drop it."""
+    if how.pairs == "closest":
+        return buffer, jnp.full_like(words, -1), give
+    side = jnp.arange(2, dtype=jnp.int32)[:, None]
+    left = jnp.where(found[None] & (side == pair.mine[None]), -1, words)
+    drop = give & ~(found & jnp.any(left >= 0, axis=0))
+    size = buffer.words.shape[1]
+    by_second = (_is(pair.second, size) & found[None])[None] & (side == pair.theirs[None])[:, None]
+    by_first = (_is(pair.first, size) & found[None])[None] & (side == pair.mine[None])[:, None]
+    return buffer._replace(words=jnp.where(by_first | by_second, -1, buffer.words)), left, drop
+
+
+def _settle(buffer: Entry, first: Array, drop: Array, filling: Array, count: Array) -> Entry:
+    """What arrived moves to the place of what is dropped, or to the next one that is free."""
+    size = buffer.words.shape[1]
+    place = jnp.where(drop, first, jnp.maximum(count - 1, 0))
+    move = drop | (filling & jnp.isfinite(buffer.depth[0, -1]))
+    target = _is(place, size) & move[None]
+    empty = Entry(
+        jnp.array([jnp.inf, 0], buffer.depth.dtype)[:, None],
+        jnp.zeros((1, 1), buffer.values.dtype),
+        jnp.full((1, 1), -1, jnp.int32),
+    )
+
+    def settle(rows, none):
+        moved = jnp.where(target[None], rows[:, -1:], rows)
+        last = jnp.where(move[None], jnp.broadcast_to(none, rows[:, -1].shape), moved[:, -1])
+        return moved.at[:, -1].set(last)
+
+    return jax.tree.map(settle, buffer, empty)
+
+
+def _account(rays: BeamRays, state: BufferState, first, second, left: Array, drop, how: KBuffer):
+    """Status bits of rays that drop an entry with a cell left, whose segment is missing.
+
+    Its other fragment is yet to come, or came too late and left before. If they turn out to be in
+    the same place, as where a ray goes through an edge, the segment has no length, and nothing is
+    missing. One such cell is remembered; a second at the same time counts as missing.
+    """
+    depth = lax.stop_gradient(first.depth[0])
+    if how.pairs == "closest":
+        reach = lax.stop_gradient(second.depth[0])
+        reach = jnp.where(drop & (reach > state.reach), reach, state.reach)
+        return state._replace(reach=reach)
+    seen = drop & (depth <= 0 if how.reverse else depth >= 0)
+    cell = packing.cell_of(jnp.max(left, axis=0))
+    both = seen & jnp.all(left >= 0, axis=0)
+    cell = jnp.where(seen, cell, -1)
+    owed, where = state.owed
+    paid = (cell >= 0) & (cell == owed)
+    apart = paid & (jnp.abs(depth - where) > _tolerance(depth, rays))
+    another = (cell >= 0) & ~paid & (owed >= 0)
+    missing = both | apart | another
+    owed = jnp.where(paid, -1, jnp.where(cell >= 0, cell, owed))
+    where = jnp.where(cell >= 0, depth, where)
+    status = state.status | jnp.where(missing, bits.K_TOO_SMALL, 0).astype(jnp.int32)
+    reach = jnp.where(drop, depth, state.reach)
+    return state._replace(owed=(owed, where), reach=reach, status=status)

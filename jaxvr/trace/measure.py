@@ -1,0 +1,155 @@
+"""How many entries a k-buffer needs, pixel by pixel (Callahan et al. 2005, section 5, Table 1).
+
+The fragments of a pixel arrive in the order of their faces' keys. How far one has to move is the
+number of those before it that are farther (`jaxvr.order.moved`); what a buffer needs follows from
+it (`jaxvr.order.entries_needed`). Only the farthest few fragments so far have to be remembered to
+count: a count that reaches their number is counted again with more of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxvr._core.checks import is_concrete
+from jaxvr.order import AbstractOrder, Centroid
+from jaxvr.trace.faces import CellFaces, cell_faces
+from jaxvr.trace.scene import make_scene
+from jaxvr.trace.stream import Sort, beam_rays, drawn, next_fragments, over, refill, start_stream
+from jaxvr.view.camera import Camera
+from jaxvr.view.tiles import TILE, batches, tile, untile
+from jaxvr.volume.mesh import TetMesh
+
+Array = jax.Array
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class KMap:
+    """What the pixels of a view ask of a k-buffer. All arrays are (height, width) int32 of NumPy.
+
+    entries: k that a pixel needs, at least 1. moved: the farthest that a fragment has to move
+    forward. fragments: how many there are.
+    """
+
+    entries: np.ndarray
+    moved: np.ndarray
+    fragments: np.ndarray
+
+    @property
+    def k(self) -> int:
+        """The smallest k that is enough for all pixels."""
+        return int(self.entries.max())
+
+    def count_above(self, k: int) -> int:
+        """Number of pixels that need more than k entries."""
+        return int((self.entries > k).sum())
+
+
+def measure_k(volume: TetMesh, camera: Camera, *, order: AbstractOrder | None = None) -> KMap:
+    """The k that `KBuffer` needs for a view, and where.
+
+    Args:
+      volume: a `TetMesh`. camera: the view. order: as for `KBuffer`; `Centroid()` if None.
+
+    Returns:
+      a `KMap`. An image with `KBuffer(k=map.k, order=order)` is right everywhere.
+
+    Fragments at the same depth to rounding (a ray through an edge) count as out of order, whichever
+    comes first. Not for use inside `jit`: how much there is to remember is only known afterwards.
+    """
+    if not isinstance(volume, TetMesh) or not isinstance(camera, Camera):
+        raise ValueError(
+            "measure_k takes a TetMesh and a Camera, but was given a "
+            f"{type(volume).__name__} and a {type(camera).__name__}."
+        )
+    if not is_concrete(*jax.tree.leaves((volume, camera))):
+        raise ValueError("measure_k cannot run inside jit or grad. Call it outside.")
+    camera = jax.tree.map(lambda x: jnp.asarray(x).astype(volume.dtype), camera)
+    size = TILE[0] * TILE[1] * 4 // volume.dtype.itemsize
+    rays, count = batches(size, tuple(tile(x) for x in camera.rays()))
+    source = _prepare(volume)
+    order, most, number = order or Centroid(), 8, rays[0].shape[0]
+    out, again = np.zeros((3, number, size), np.int32), np.arange(number)
+    while len(again):
+        # A power of two of batches, so that few functions are compiled.
+        some = np.resize(again, 1 << (len(again) - 1).bit_length())
+        found = np.stack(_measure(order, most, source, *(x[some] for x in rays)))[:, : len(again)]
+        out[:, again] = found
+        again = again[found[1].max(axis=1) >= most]
+        most *= 4
+    flat = out.reshape(3, -1, 1)[:, :count]
+    return KMap(*(np.asarray(untile(x, camera.height, camera.width))[..., 0] for x in flat))
+
+
+class _Counts(NamedTuple):
+    """farthest (M, R): depths of the M farthest fragments so far. first (R,): depth of the closest,
+    and how far it moved. rest (R,): the same of all others. fragments (R,)."""
+
+    farthest: Array
+    first: tuple[Array, Array]
+    rest: Array
+    fragments: Array
+
+
+@jax.jit
+def _prepare(volume: TetMesh) -> CellFaces:
+    return cell_faces(make_scene(volume))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _measure(
+    order: AbstractOrder, most: int, source: CellFaces, origins: Array, directions: Array
+) -> Any:
+    """entries, moved and fragments of batches of rays (batches, R), counted up to `most`."""
+    size, dtype = origins.shape[1], origins.dtype
+
+    def one(inputs):
+        rays = beam_rays(*inputs, source.scene.scale)
+        stream, sort = start_stream(source, size), Sort(order)
+        integer = jnp.zeros(size, jnp.int32)
+        far = jnp.full(size, jnp.inf, dtype)
+        nothing = _Counts(jnp.full((most, size), -jnp.inf, dtype), (far, integer), integer, integer)
+
+        def going(loop):
+            return ~(over(loop[0]) & jnp.all(drawn(loop[0])))
+
+        def body(loop):
+            stream, counts = loop
+            stream = refill(stream, jnp.all(drawn(stream)), source, rays, sort)
+            stream, new = next_fragments(stream, source, rays.sheared, jnp.ones(size, bool))
+            # Depths are compared without what rounding may do to them.
+            eps = jnp.finfo(dtype).eps
+            slack = 16 * eps * (jnp.abs(new.at.z) + jnp.abs(rays.sheared.eye))
+            return stream, _count(counts, new.hit, new.at.z, slack)
+
+        _, counts = lax.while_loop(going, body, (stream, nothing))
+        first = counts.first[1]
+        entries = jnp.maximum(jnp.maximum(counts.rest + 1, first), 1)
+        return entries, jnp.maximum(counts.rest, first), counts.fragments
+
+    return lax.map(one, (origins, directions))
+
+
+def _count(counts: _Counts, hit: Array, depth: Array, slack: Array) -> _Counts:
+    farthest, (first, of_first), rest, fragments = counts
+    moved = jnp.sum(farthest > (depth - slack)[None], axis=0, dtype=jnp.int32)
+    least = jnp.argmin(farthest, axis=0)
+    here = jnp.arange(farthest.shape[0])[:, None] == least[None]
+    farthest = jnp.where(here & hit[None], jnp.maximum(farthest, depth[None]), farthest)
+    closer = depth < first
+    others = jnp.where(closer, of_first, moved)
+    return _Counts(
+        farthest,
+        (
+            jnp.where(hit & closer, depth, first),
+            jnp.where(hit & closer, moved, of_first),
+        ),
+        jnp.where(hit & (jnp.isfinite(first) | ~closer), jnp.maximum(rest, others), rest),
+        fragments + hit.astype(jnp.int32),
+    )
