@@ -52,12 +52,12 @@ from jaxvr._core import status as bits
 from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment
 from jaxvr.render import BATCH
-from jaxvr.view.tiles import TILE
 from jaxvr.trace.entry import build_boxes, no_entries, search
 from jaxvr.trace.face import Face, choose, opposite_edges, sizes_of
 from jaxvr.trace.local import edges_to_apex, exit_face, leave_by
 from jaxvr.trace.scene import entry_corners, make_scene, merged_points
 from jaxvr.trace.shear import ShearedRays, shear_points, shear_rays
+from jaxvr.view.tiles import TILE
 from jaxvr.volume import packing
 
 Array = jax.Array

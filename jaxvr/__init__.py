@@ -12,8 +12,8 @@ has no gradient, depths and scalars are arithmetic on local data and have one. A
 shade many, since segments do not depend on the transfer function.
 
 Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, `view`, `optics`,
-`order`, `trace`, `composite`, `native`, `adjoint`, `render`, `fit`, `plot`, `cli`. Those of `native` are
-compiled loops, which serve where they can with the same results.
+`order`, `trace`, `composite`, `native`, `adjoint`, `render`, `fit`, `plot`, `cli`. Those of
+`native` are compiled loops, which serve where they can with the same results.
 """
 
 from jaxvr import native, order

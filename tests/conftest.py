@@ -7,6 +7,10 @@ import os
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# One thread compiles a function: with a worker on each core, dividing the work only costs.
+os.environ["XLA_FLAGS"] = " ".join(
+    ("--xla_cpu_parallel_codegen_split_count=1", os.environ.get("XLA_FLAGS", ""))
+)
 
 import jax
 import pytest
@@ -17,6 +21,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 DATA = Path(os.environ.get("JAXVR_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 MANY_MAPS = 40_000
+
+# Tracing makes millions of small objects, few of them garbage: by default a quarter of the time of
+# all tests goes into looking through them.
+gc.set_threshold(200_000, 20, 50)
 
 
 @pytest.fixture(scope="session")
@@ -46,6 +54,18 @@ def free_compiled_code():
 @pytest.fixture(params=["float32", "float64"])
 def dtype(request):
     return request.param
+
+
+@pytest.fixture(scope="module")
+def quick_code():
+    """`render`, `render_rays`, `trace` and `shade` outside of `jit` compile in a third of the time:
+    see `quick`. For modules that do not test rounding."""
+    import quick
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, verb in quick.verbs().items():
+            patch.setattr(quick.RENDER, name, verb)
+        yield
 
 
 @pytest.fixture(scope="module", params=["compiled", "jax"])

@@ -13,6 +13,8 @@ import pytest
 import jaxvr
 from jaxvr.cli import main
 
+pytestmark = pytest.mark.usefixtures("quick_code")
+
 
 @pytest.fixture(scope="module")
 def mesh(tmp_path_factory):

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 import registry
 
 import jaxvr
@@ -55,15 +56,13 @@ def directional(image, args, tangents, adjoint: str):
         value, pull = jax.vjp(image, args)
         return value, pull(WEIGHTS)[0]
 
-    # Compiling is all the time that these tests take; without LLVM's optimiser it is two thirds.
-    options = {"xla_backend_optimization_level": 0}
     if not ENTRIES[adjoint].reverse:
-        compiled = jax.jit(forward, compiler_options=options)
+        compiled = quick.jit(forward)
         results = [compiled(args, t) for t in tangents]
         return np.asarray(results[0][0]), [
             float(jnp.sum(WEIGHTS * change)) for _, change in results
         ]
-    value, bars = jax.jit(reverse, compiler_options=options)(args)
+    value, bars = quick.jit(reverse)(args)
 
     def along(tangent):
         pairs = zip(jax.tree.leaves(bars), jax.tree.leaves(tangent), strict=True)

@@ -14,6 +14,8 @@ import registry
 
 import jaxvr
 
+pytestmark = pytest.mark.usefixtures("quick_code")
+
 SIZE = {"width": 6, "height": 5}
 
 

@@ -58,10 +58,9 @@ class FirstVertex(AbstractOrder):
 
 
 def distance(points: Array, faces: Faces) -> Array:
-    """What grows with the distance (N,) of points (3, N): its square, negative behind the eye, or
-    the depth, where rays are parallel."""
+    """What grows with the distance (N,) of points (3, N) along rays: its square, or the depth where
+    they are parallel."""
     x, y, z = points
     f = faces.forward
-    depth = x * f[0] + y * f[1] + z * f[2]
     square = x * x + y * y + z * z
-    return jnp.where(faces.pinhole, jnp.where(depth < 0, -square, square), depth)
+    return jnp.where(faces.pinhole, square, x * f[0] + y * f[1] + z * f[2])

@@ -120,8 +120,8 @@ class KBuffer(AbstractTracer):
     by the depth of their nearer ends, while `RayCast` takes whole paths; the rings of cells that it
     misses there are found here.
 
-    Rays that share an origin (pinhole) or a direction (orthographic) with their batch are fast; any
-    others are tested against every face.
+    Rays that share an origin (pinhole) or a direction (orthographic) with their batch are fast. Any
+    others are tested against every face, in an order that suits them only roughly.
 
     Raises:
       ValueError: if k is not a positive integer, or order or pairs are not what they may be.

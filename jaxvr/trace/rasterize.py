@@ -9,7 +9,6 @@ and can be had again, as differentiable functions of points, values and camera: 
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 from typing import Any
 
@@ -37,7 +36,7 @@ from jaxvr.trace.stream import (
     start_stream,
 )
 from jaxvr.view.camera import Camera
-from jaxvr.view.tiles import TILE, batches, tile, tile_order
+from jaxvr.view.tiles import TILE, batches, tile_order
 
 Array = jax.Array
 
@@ -108,8 +107,8 @@ def rasterize(
         drawn; `jaxvr.order.Centroid()` if None.
 
     Returns:
-      `Fragments`, in front of the camera only, in the widest float type of points and values. Memory
-      while drawing: bounded by tiles of the image, about 8 MB; the result is 16 bytes each.
+      `Fragments`, in front of the camera only, in the widest float type of points and values.
+      Memory while drawing is bounded by tiles of the image, about 8 MB; a fragment is 16 bytes.
 
     Raises:
       ValueError: for wrong shapes, indices out of range, a triangle with a point twice, NaN or
@@ -132,14 +131,17 @@ def rasterize(
     require_finite("values", values)
     triangles = _checked(triangles, len(points))
     camera = jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), camera)
-    source = _source(jnp.asarray(points), jnp.asarray(values), jnp.asarray(triangles))
+    source = triangle_source(jnp.asarray(points), jnp.asarray(values), jnp.asarray(triangles))
     sort = Sort(order or Centroid())
-    counts = np.asarray(_count(sort, source, camera))
+    # Rays and not the camera: one compiled function for all kinds of them.
+    order_of = tile_order(camera.height, camera.width)
+    rays = tuple(x.reshape(-1, 3)[order_of] for x in camera.rays())
+    counts = np.asarray(_count(sort, source, rays))
     start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     total = int(start[-1])
     room = max(1 << max(total - 1, 0).bit_length(), 1024)
-    faces, depths, scalars = _fill(sort, source, camera, start[:-1].astype(np.int32), room)
-    ray = np.repeat(tile_order(camera.height, camera.width), counts)
+    faces, depths, scalars = _fill(sort, source, rays, start[:-1].astype(np.int32), room)
+    ray = np.repeat(order_of, counts)
     by_pixel = np.argsort(ray, kind="stable")
     faces, depths, scalars = (
         jnp.asarray(np.asarray(x)[:total][by_pixel]) for x in (faces, depths, scalars)
@@ -176,7 +178,8 @@ def _checked(triangles: Any, points: int) -> np.ndarray:
 
 
 @jax.jit
-def _source(points: Array, values: Array, triangles: Array) -> Triangles:
+def triangle_source(points: Array, values: Array, triangles: Array) -> Triangles:
+    """Triangles (F, 3) over points (P, 3) with scalars (P,)."""
     scale = scale_of(points)
     points = points * scale
     ids = jnp.sort(triangles, axis=1)
@@ -208,17 +211,15 @@ def _walk(sort: Sort, source: Triangles, rays: Any, carry: Any, add: Any) -> Any
     return lax.while_loop(going, body, (start_stream(source, size), carry))[1]
 
 
-def _batches(source: Triangles, camera: Camera, *more: Array) -> Any:
-    order = tile_order(camera.height, camera.width)
-    size = TILE[0] * TILE[1] * 4 // source.vertices.dtype.itemsize
-    rays = (x.reshape(-1, 3)[order] for x in camera.rays())
-    return batches(size, (*rays, *more))
+def _size(source: Triangles) -> int:
+    """Rays of a batch."""
+    return TILE[0] * TILE[1] * 4 // source.vertices.dtype.itemsize
 
 
 @partial(jax.jit, static_argnums=0)
-def _count(sort: Sort, source: Triangles, camera: Camera) -> Array:
-    """Fragments of each ray, tile after tile."""
-    rays, count = _batches(source, camera)
+def _count(sort: Sort, source: Triangles, rays: Any) -> Array:
+    """Fragments of each ray."""
+    rays, count = batches(_size(source), rays)
 
     def one(inputs):
         batch = beam_rays(*inputs, source.scale)
@@ -229,8 +230,9 @@ def _count(sort: Sort, source: Triangles, camera: Camera) -> Array:
 
 
 @partial(jax.jit, static_argnums=(0, 4))
-def _fill(sort: Sort, source: Triangles, camera: Camera, start: Array, room: int) -> Any:
-    (origins, directions, start), _ = _batches(source, camera, start)
+def _fill(sort: Sort, source: Triangles, rays: Any, start: Array, room: int) -> Any:
+    """Slots, depths and scalars (room,), ray after ray from `start` (R,) on."""
+    (origins, directions, start), _ = batches(_size(source), (*rays, start))
 
     def one(arrays, inputs):
         origins, directions, first = inputs
@@ -255,7 +257,7 @@ def _fill(sort: Sort, source: Triangles, camera: Camera, start: Array, room: int
 
 @jax.jit
 def _locate(fragments: Fragments, points: Array, values: Array, camera: Camera) -> Any:
-    source = _source(points, values, fragments.triangles)
+    source = triangle_source(points, values, fragments.triangles)
     origins, directions = (x.reshape(-1, 3)[fragments.pixel] for x in camera.rays())
     rays = shear_rays(origins, directions, source.scale)
     wanted = jnp.ones((), bool)

@@ -175,9 +175,7 @@ def over(stream: Stream) -> Array:
     return ~stream.selection.more & (stream.chunk[1] >= stream.selection.count)
 
 
-def refill(
-    stream: Stream, wanted: Array, source: FaceSource, rays: BeamRays, sort: Sort
-) -> Stream:
+def refill(stream: Stream, wanted: Array, source: FaceSource, rays: BeamRays, sort: Sort) -> Stream:
     """The next chunk's bits, if `wanted` () and there is one."""
     source, rays = lax.stop_gradient((source, rays))
     again = wanted & (stream.chunk[1] >= stream.selection.count) & stream.selection.more
@@ -400,4 +398,3 @@ def face_at(source: FaceSource, rays: ShearedRays, slot: Array, wanted: Array) -
     found = load(wanted, find, source, rays, slot)
     a, b, c = (project(rays, (*(found[j, k] for j in range(4)),), wanted) for k in range(3))
     return a, b, c
-

@@ -54,7 +54,7 @@ def refine(mesh: TetMesh, share: float = 0.01, rounds: int = 3, deviation: float
 
     A chosen cell has its longest edge bisected, with all cells round it, five or so; but longer
     edges of these come first, and the cell itself in a later round (see the module). A round adds
-    up to 5 `share` of the cells, usually less than half of that. Points keep their ids, new ones
+    some 5 `share` of the cells at most, usually less than half. Points keep their ids, new ones
     follow; halves of a cell stand where it stood. The field is the same function of space, to
     rounding: midpoints of point data are means, cell data are inherited, corner data interpolated.
     What is cut depends on the geometry alone, so two fields on the same mesh are refined alike. A

@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
+import quick
 from jax import lax
 
 from jaxvr.adjoint import Pipeline
@@ -14,7 +14,7 @@ from jaxvr.adjoint.base import Operands, begin, busy, iterate
 from jaxvr.trace import RayCast, Recorded, Segments
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(quick.jit, static_argnums=(0, 1, 2))
 def iterations(integrator, compositor, shorten: bool, volume: Any, rays: Any, transfer: Any):
     """Iterations () of one batch of rays, by the loop of `march_while`.
 

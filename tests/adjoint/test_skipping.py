@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 import registry
 
 import jaxvr
@@ -112,15 +113,15 @@ def derivatives(adjoint, extinctions):
 def test_gradients_at_extinction_zero_are_those_of_the_whole_walk(extinctions):
     loss, args = derivatives(jaxvr.Replay(), extinctions)
     direct, _ = derivatives(DIRECT, extinctions)
-    everything = jax.grad(loss, argnums=(0, 1, 2))(*args)
-    want = jax.grad(direct, argnums=(0, 1, 2))(*args)
+    everything = quick.jit(jax.grad(loss, argnums=(0, 1, 2)))(*args)
+    want = quick.jit(jax.grad(direct, argnums=(0, 1, 2)))(*args)
     for got, expected in zip(jax.tree.leaves(everything), jax.tree.leaves(want), strict=True):
         scale = np.max(np.abs(expected)) + 1e-30
         assert np.max(np.abs(got - expected)) <= 1e-12 * scale
     # Every control point in the range of the values has a gradient; the first is below it.
     assert np.all(np.abs(np.asarray(everything[0].extinctions[1:])) > 1e-6)
     # Without one for the transfer function the backward pass takes runs at once.
-    alone = jax.grad(loss, argnums=(1, 2))(*args)
+    alone = quick.jit(jax.grad(loss, argnums=(1, 2)))(*args)
     for got, expected in zip(alone, want[1:], strict=True):
         scale = np.max(np.abs(expected)) + 1e-30
         assert np.max(np.abs(got - expected)) <= 1e-12 * scale
@@ -130,7 +131,7 @@ def test_gradient_at_extinction_zero_against_one_sided_differences():
     loss, args = derivatives(jaxvr.Replay(), TAU)
     rng = np.random.default_rng(4)
     way = np.where(TAU == 0, rng.uniform(0.5, 1.5, 12), 0)
-    value = jax.jit(loss)
+    value = quick.jit(loss)
 
     def at(h):
         return float(value(transfer_of(TAU + h * way), *args[1:]))
@@ -138,14 +139,15 @@ def test_gradient_at_extinction_zero_against_one_sided_differences():
     def one_sided(h):
         return (4 * at(h) - at(2 * h) - 3 * at(0.0)) / (2 * h)
 
-    slope = float(jnp.sum(jax.grad(loss)(*args).extinctions * way))
+    slope = float(jnp.sum(quick.jit(jax.grad(loss))(*args).extinctions * way))
     coarse, fine = one_sided(2e-4), one_sided(1e-4)
     assert slope == pytest.approx((4 * fine - coarse) / 3, rel=1e-8)
     forward, args = derivatives(jaxvr.Forward(), TAU)
     zero = jax.tree.map(jnp.zeros_like, args)
     leaves, structure = jax.tree.flatten(zero[0])
     move = structure.unflatten([*leaves[:2], jnp.asarray(way)])
-    assert float(jax.jvp(forward, args, (move, *zero[1:]))[1]) == pytest.approx(slope, rel=1e-12)
+    along = quick.jit(lambda args, way: jax.jvp(forward, args, way)[1])(args, (move, *zero[1:]))
+    assert float(along) == pytest.approx(slope, rel=1e-12)
 
 
 def test_gradients_of_the_mesh_alone_are_those_of_the_whole_walk():
@@ -157,7 +159,7 @@ def test_gradients_of_the_mesh_alone_are_those_of_the_whole_walk():
             volume = mesh.replace(values=values, points=points)
             return jnp.sum(WEIGHTS * jaxvr.render(volume, camera, transfer, adjoint=adjoint))
 
-        return jax.jit(jax.grad(loss, argnums=(0, 1)))(mesh.values, mesh.points)
+        return quick.jit(jax.grad(loss, argnums=(0, 1)))(mesh.values, mesh.points)
 
     for got, want in zip(gradient(jaxvr.Replay()), gradient(DIRECT), strict=True):
         assert np.max(np.abs(got - want)) <= 1e-12 * np.max(np.abs(want))

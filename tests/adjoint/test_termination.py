@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 import registry
 
 import jaxvr
@@ -85,7 +86,6 @@ def test_gradient_is_that_of_the_truncated_image(how):
     mesh, camera, transfer = thick("float64")
     segments = segments_of("float64")
 
-    @jax.jit
     def loss(args):
         if how == "shade":
             scalar, length, tf = args
@@ -107,11 +107,13 @@ def test_gradient_is_that_of_the_truncated_image(how):
     if how == "shade":  # a jump in the scalar is a node of length 0, and has to stay one
         way[1] = jnp.where(leaves[1] == 0, 0, way[1])
 
+    value = quick.jit(loss)
+
     def at(h):
         moved = [x + h * w for x, w in zip(leaves, way, strict=True)]
-        return float(loss(structure.unflatten(moved)))
+        return float(value(structure.unflatten(moved)))
 
-    bars = jax.tree.leaves(jax.grad(loss)(args))
+    bars = jax.tree.leaves(quick.jit(jax.grad(loss))(args))
     slope = float(sum(jnp.sum(b * w) for b, w in zip(bars, way, strict=True)))
     coarse, fine = ((at(h) - at(-h)) / (2 * h) for h in (2e-6, 1e-6))
     assert slope == pytest.approx((4 * fine - coarse) / 3, rel=1e-6)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 
 from jaxvr.optics import Segment, TransferFunction
 
@@ -71,11 +71,13 @@ def integrate(integrator, tf, segment, start=None):
     return rgb, depth, done
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def colors_of(integrator, tf, segment):
+def traced_colors_of(integrator, tf, segment):
     """rgb and depth of segments, (4, R). NaN where the segment was not finished."""
     rgb, depth, done = integrate(integrator, tf, segment)
     return jnp.where(done[None], jnp.concatenate([rgb, depth[None]]), jnp.nan)
+
+
+colors_of = quick.jit(traced_colors_of, static_argnums=0)
 
 
 def check_slopes(function, args, rtol, seed=0, steps=(1e-5, 5e-6)):
@@ -85,7 +87,7 @@ def check_slopes(function, args, rtol, seed=0, steps=(1e-5, 5e-6)):
     rng = np.random.default_rng(seed)
     way = [jnp.asarray(rng.normal(size=jnp.shape(x))) for x in leaves]
 
-    @jax.jit
+    @quick.jit
     def both(leaves):
         def projected(leaves):
             out = jnp.concatenate(

@@ -8,9 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 
 from jaxvr.optics import Analytic, PartialPreIntegration, TransferFunction
-from tests.optics.segments import CASES, TF, colors_of, random_segments, segment_of
+from tests.optics.segments import (
+    CASES,
+    TF,
+    colors_of,
+    random_segments,
+    segment_of,
+    traced_colors_of,
+)
 
 # Without jumps, and with two control points so close that they share a texel.
 CLOSE = TransferFunction(
@@ -22,12 +30,12 @@ SPECIAL = segment_of(CASES + [(0.301, 0.1, 1.0), (0.8, 0.3, 2.0), (0.1, 0.1, 1.0
 RANDOM = random_segments(len(SPECIAL.front))
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(quick.jit, static_argnums=0)
 def slopes(integrator, tf, segment):
     """The derivative of a projection of rgb and depth by everything."""
 
     def projected(tf, segment):
-        out = colors_of(integrator, tf, segment)
+        out = traced_colors_of(integrator, tf, segment)
         return jnp.sum(out * jnp.cos(jnp.arange(out.size)).reshape(out.shape))
 
     return jax.grad(projected, argnums=(0, 1))(tf, segment)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 
 from jaxvr.optics import Analytic, PreIntegration, Segment, TransferFunction
 from jaxvr.optics.partition import nodes_of
@@ -44,7 +45,7 @@ def built(n_f, n_b, count=32, constant=False):
     in the last."""
     nodes = nodes_of(CONSTANT if constant else UNIT, "float64")
 
-    @jax.jit
+    @quick.jit
     def make(nodes):
         scalars = jnp.arange(n_f) / (n_f - 1.0), jnp.arange(n_b) / (n_b - 1.0)
         unit = 2.0 / count
@@ -215,7 +216,7 @@ def test_saturated_opacity_has_finite_depth_and_gradients():
     )
     integrator = PreIntegration(SIZE)
 
-    @jax.jit
+    @quick.jit
     def both(tf, segment):
         def loss(tf, segment):
             table = integrator.prepare(tf, "float32", jnp.asarray(2.0))
@@ -238,7 +239,7 @@ def test_slab_comes_near_the_exact_one():
     rng = np.random.default_rng(0)
     tau = rng.uniform(0, 3, (2, 7, 50))
     inputs = (tau[0], tau[1, 0], rng.random((7, 50, 3)), rng.random(3), rng.uniform(0, 2, (7, 1)))
-    slab = jax.jit(lambda integrator, *inputs: integrator.slab(*inputs), static_argnums=0)
+    slab = quick.jit(lambda integrator, *inputs: integrator.slab(*inputs), static_argnums=0)
     want = slab(Analytic(), *inputs)
     errors = []
     for n in (9, 33):

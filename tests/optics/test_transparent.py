@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import quick
 
 from jaxvr.optics import Analytic, PartialPreIntegration, Quadrature, Segment, TransferFunction
 from jaxvr.optics.partition import merge_transparent, nodes_of
@@ -57,7 +58,7 @@ def test_control_points_inside_of_runs_go(extinctions, left, dtype):
     assert np.array_equal(np.asarray(got.optical)[:, kept], before)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 3))
+@functools.partial(quick.rounded_jit, static_argnums=(0, 3))
 def walk(integrator, tf, segment, how):
     """Whole segments with a shortened table or the original one: rgb and depth (4, R), pieces and
     the slab's control points (2, R) around the end."""
@@ -146,7 +147,7 @@ def test_derivatives_with_respect_to_segments_are_kept(how):
         assert np.allclose(got, expected, rtol=1e-13, atol=1e-16)
 
 
-@jax.jit
+@quick.rounded_jit
 def slopes(table, segment):
     integrator = Analytic()
 

@@ -1,4 +1,4 @@
-"""Keys by centroid and by first vertex: against numpy, behind the eye, and along rays."""
+"""Keys by centroid and by first vertex: against numpy, and along rays."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -36,28 +36,20 @@ def test_against_numpy(order, pinhole, dtype):
     corners = random_corners()
     points = sorted_by(order, corners)
     depth = points @ FORWARD
-    want = np.sign(depth) * np.linalg.norm(points, axis=1) ** 2 if pinhole else depth
+    want = np.linalg.norm(points, axis=1) ** 2 if pinhole else depth
     keys = order.keys(faces_of(corners, pinhole, dtype))
-    assert keys.dtype == dtype and 10 < (depth < 0).sum() < 40
+    assert keys.dtype == dtype
     bound = 8 * np.finfo(dtype).eps * (points**2).sum(1).max()
     assert np.abs(np.asarray(keys) - want).max() < bound
-
-
-@views
-@both
-def test_negative_behind_the_eye_only(order, pinhole):
-    corners = random_corners()
-    keys = np.asarray(order.keys(faces_of(corners, pinhole)))
-    assert np.array_equal(keys < 0, sorted_by(order, corners) @ FORWARD < 0)
 
 
 @dtypes
 @views
 @both
 def test_grows_along_rays(order, pinhole, dtype):
-    """One small face carried along each of some rays, from behind the eye to ahead of it."""
+    """One small face carried along each of some rays, away from where they start."""
     rng = np.random.default_rng(1)
-    along = np.linspace(-2, 2, 30)
+    along = np.linspace(0, 2, 30)
     for _ in range(20):
         shape = 0.01 * rng.normal(size=(3, 3))
         shape -= sorted_by(order, shape[None])

@@ -12,6 +12,8 @@ from jaxvr.trace.entry import PEEL
 from jaxvr.trace.scene import make_scene, merged_points
 from jaxvr.volume import datasets
 
+pytestmark = pytest.mark.usefixtures("quick_code")
+
 TETS = np.array([[0, 1, 2, 3]])
 CORNER = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
 

@@ -1,0 +1,59 @@
+"""What refining degenerate cells does to the k that a k-buffer needs (Callahan et al. 2005,
+section 5).
+
+    python -m experiments.kbuffer_refine bluntfin.vtu:density can.vtu:EQPS_node ... [--json F]
+
+For each mesh as it is, refined by deviation from the Delaunay property, and by size alone: cells,
+and over the viewpoints the largest k, its mean and the pixels that need more than 6, sorted by
+centroid and by first vertex. And the largest change of the picture, which is none.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+import jaxvr
+from experiments.common import machine, table, transfer_of, write_json
+from experiments.havs import ORDERS, options, viewpoints, volumes
+
+
+def run(volume: jaxvr.TetMesh, name: str, size: int, views: int, shares: list[float]):
+    cameras, transfer = viewpoints(volume, size)[-views:], transfer_of(volume)
+    before = np.asarray(jaxvr.render(volume, cameras[0], transfer))
+    meshes = {"as it is": volume}
+    for share in shares:
+        meshes[f"by deviation, {share:g}"] = jaxvr.refine(volume, share)
+        meshes[f"by size, {share:g}"] = jaxvr.refine(volume, share, deviation=0.0)
+    rows = []
+    for label, mesh in meshes.items():
+        row: dict[str, Any] = {"mesh": name, "refined": label, "tets": mesh.n_tets}
+        for key, order in ORDERS.items():
+            found = [jaxvr.measure_k(mesh, camera, order=order) for camera in cameras]
+            row[f"k, {key}"] = max(f.k for f in found)
+            row[f"mean k, {key}"] = float(np.mean([f.k for f in found]))
+            row[f"> 6, {key}"] = max(f.count_above(6) for f in found)
+        after = np.asarray(jaxvr.render(mesh, cameras[0], transfer))
+        row["change"] = float(np.abs(after - before).max())
+        rows.append(row)
+        print(table([row]), flush=True)
+    return rows
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    found = options(__doc__, arguments, views=6, shares=[0.01, 0.05])
+    if found.tiny:
+        found.views, found.shares = 1, [0.05]
+    rows = []
+    for name, volume in volumes(found).items():
+        rows += run(volume, name, found.size, found.views, found.shares)
+    print(table(rows))
+    report = {"machine": machine(), "size": found.size, "views": found.views, "rows": rows}
+    if found.json:
+        write_json(found.json, report)
+    return report
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,170 @@
+"""Where a frame's time goes: select and sort faces, cover, fragments, k-buffer, integrate.
+
+    python -m experiments.kbuffer_stages bluntfin.vtu:density ... [--k 6] [--json F]
+
+Each stage is the difference of two timings of the same loops with more and more of them: faces of
+all tiles selected and sorted; bits of which rays may meet them; fragments taken; k-buffers fed; the
+whole render. Of the first, sorting alone is timed on lists of the same lengths. And the entry
+points of `RayCast`, found by its hierarchy and by the rasteriser over the boundary.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+import jaxvr
+from experiments.common import machine, median_of, table, transfer_of, write_json
+from experiments.havs import options, viewpoints, volumes
+from jaxvr.trace import stream as streams
+from jaxvr.trace.entry import search
+from jaxvr.trace.rasterize import triangle_source
+from jaxvr.view.tiles import TILE, batches, tile
+from jaxvr.volume import packing
+
+SIZE = TILE[0] * TILE[1]
+
+
+def _tiles(camera: jaxvr.Camera) -> Any:
+    return batches(SIZE, tuple(tile(x) for x in camera.rays()))[0]
+
+
+def _selected(scene: Any, rays: Any, sort: Any) -> Any:
+    stream = streams.start_stream(scene, SIZE)
+    held = lax.stop_gradient((scene, rays))
+    return stream._replace(selection=streams._select(sort)(stream.selection, *held))
+
+
+def _select(scene: Any, rays: Any, sort: Any) -> Any:
+    return _selected(scene, rays, sort).selection.count
+
+
+def _sort_only(scene: Any, rays: Any, count: Any, sort: Any) -> Any:
+    """Sorts lists as long as those of the tiles, in no order before."""
+    size = streams.start_stream(scene, SIZE).selection.faces.shape[0]
+    number = jnp.arange(size, dtype=jnp.int32)
+    faces = jnp.stack([(number * jnp.int32(40503)) % 65521, number], 1)
+    return streams._sort_first(faces, count)[0, 0]
+
+
+def _cover(scene: Any, rays: Any, sort: Any) -> Any:
+    stream = _selected(scene, rays, sort)
+
+    def going(stream):
+        return ~streams.over(stream)
+
+    def body(stream):
+        return streams.refill(stream, jnp.ones((), bool), scene, rays, sort)
+
+    return lax.while_loop(going, body, stream).groups
+
+
+def _fragments(scene: Any, rays: Any, sort: Any) -> Any:
+    def going(loop):
+        return ~(streams.over(loop[0]) & jnp.all(streams.drawn(loop[0])))
+
+    def body(loop):
+        stream, total, depth = loop
+        stream = streams.refill(stream, jnp.all(streams.drawn(stream)), scene, rays, sort)
+        go = jnp.ones(SIZE, bool)
+        stream, new = streams.next_fragments(stream, scene, rays.sheared, go)
+        return stream, total + new.hit, depth + jnp.where(new.hit, new.at.z + new.at.value, 0)
+
+    zero = jnp.zeros(SIZE, jnp.int32)
+    loop = (streams.start_stream(scene, SIZE), zero, jnp.zeros(SIZE, rays.origins.dtype))
+    return lax.while_loop(going, body, loop)[1:]
+
+
+def _walk(scene: Any, rays: Any, tracer: jaxvr.KBuffer) -> Any:
+    def going(loop):
+        return jnp.any(loop[0].active | loop[0].waiting)
+
+    def body(loop):
+        state, length, scalar = loop
+        state = tracer.step(scene, rays, state, state.active)
+        segment = state.segment
+        return state, length + segment.length, scalar + segment.front - segment.back
+
+    zero = jnp.zeros(SIZE, rays.origins.dtype)
+    return lax.while_loop(going, body, (tracer.start(scene, rays), zero, zero))[1:]
+
+
+def _entries(caster: jaxvr.RayCast, scene: Any, rays: Any) -> Any:
+    last = (jnp.full(SIZE, -jnp.inf), jnp.full(SIZE, -1, jnp.int32))
+    return search(scene.mesh, rays, scene.boxes, jnp.ones(SIZE, bool), last).depth
+
+
+def run(volume: jaxvr.TetMesh, name: str, size: int, k: int, repeat: int) -> list[dict[str, Any]]:
+    camera, transfer = viewpoints(volume, size)[-1], transfer_of(volume)
+    tracer, sort = jaxvr.KBuffer(k=k), streams.Sort(jaxvr.order.Centroid())
+    scene, rays = jax.jit(tracer.prepare)(volume), _tiles(camera)
+    rays = jax.jit(jax.vmap(partial(tracer.prepare_rays, scene)))(*rays)
+
+    def of_tiles(stage, *static):
+        return jax.jit(lambda scene, rays: lax.map(lambda r: stage(scene, r, *static), rays))
+
+    counts = of_tiles(_select, sort)(scene, rays)
+    caster = jaxvr.RayCast()
+    cast = jax.jit(caster.prepare)(volume)
+    cast_rays = jax.jit(jax.vmap(partial(caster.prepare_rays, cast)))(*_tiles(camera))
+    search_all = jax.jit(lambda s, rays: lax.map(lambda r: _entries(caster, s, r), rays))
+    sort_all = jax.jit(lambda s, c: lax.map(lambda n: _sort_only(s, None, n, sort), c))
+    words = np.asarray(volume.boundary)
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[packing.corner_of(words)]
+    boundary = np.asarray(volume.cells)[packing.cell_of(words)[:, None], others]
+    values = jnp.zeros(volume.n_points, volume.dtype)
+    surface = triangle_source(volume.points, values, jnp.asarray(boundary))
+    draw_all = of_tiles(_fragments, sort)
+    tasks = {
+        "select": lambda f=of_tiles(_select, sort): f(scene, rays),
+        "sort": lambda: sort_all(scene, counts),
+        "cover": lambda f=of_tiles(_cover, sort): f(scene, rays),
+        "fragments": lambda: draw_all(scene, rays),
+        "walk": lambda f=of_tiles(_walk, tracer): f(scene, rays),
+        "render": lambda: jaxvr.render(volume, camera, transfer, tracer=tracer, status=True),
+        "prepare": lambda f=jax.jit(tracer.prepare): f(volume),
+        "entries by hierarchy": lambda: search_all(cast, cast_rays),
+        "entries by rasteriser": lambda: draw_all(surface, rays),
+    }
+    t = median_of(tasks, repeat, quiet=True)
+    hits = int(jnp.sum(draw_all(scene, rays)[0]))
+    stages = {
+        "prepare": t["prepare"],
+        "select faces of tiles": t["select"] - t["sort"],
+        "sort them": t["sort"],
+        "cover": t["cover"] - t["select"],
+        "take fragments": t["fragments"] - t["cover"],
+        "k-buffer": t["walk"] - t["fragments"],
+        "integrate and composite": t["render"] - t["walk"] - t["prepare"],
+    }
+    rows = [
+        {"mesh": name, "stage": stage, "seconds": seconds, "share": seconds / t["render"]}
+        for stage, seconds in stages.items()
+    ]
+    for key in ("render", "entries by hierarchy", "entries by rasteriser"):
+        rows.append({"mesh": name, "stage": key, "seconds": t[key], "share": None})
+    print(f"{name}: {hits} fragments")
+    print(table(rows), flush=True)
+    return rows
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    found = options(__doc__, arguments, repeat=3, k=6)
+    if found.tiny:
+        found.repeat = 1
+    rows = []
+    for name, volume in volumes(found).items():
+        rows += run(volume, name, found.size, found.k, found.repeat)
+    report = {"machine": machine(), "size": found.size, "k": found.k, "rows": rows}
+    if found.json:
+        write_json(found.json, report)
+    return report
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""Compiling in a third of the time, for tests of what is computed and not of how it is rounded:
+those of exactness, lost rays, speed and memory keep what users get.
+
+Compiling is nearly all the time that the tests take. Left out are LLVM's optimiser, and XLA's
+emitters by way of MLIR, which set up a compiler for each kernel; its older ones do the same.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from typing import Any
+
+import jax
+
+from jaxvr._core.checks import is_concrete
+
+EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+jit = functools.partial(jax.jit, compiler_options=EMITTERS | {"xla_backend_optimization_level": 0})
+# With LLVM's optimiser, which fuses products and sums: where those may be rounded once or twice.
+rounded_jit = functools.partial(jax.jit, compiler_options=EMITTERS)
+
+RENDER: Any = importlib.import_module("jaxvr.render")  # `jaxvr.render` is the function
+STATIC = {
+    "_render": (0, 1, 2),
+    "_render_rays": (0, 1, 2),
+    "_shade": (0, 1, 2),
+    "_count": (0, 1, 2),
+    "_fill": (0, 1, 2, 7),
+}
+
+
+class Verb:
+    """A compiled function of `jaxvr.render` in quick code; what is traced is left to the caller's
+    own `jit` or `grad`, since options are those of the outermost."""
+
+    def __init__(self, name: str):
+        self.own: Any = getattr(RENDER, name)
+        self.quick: Any = jit(self.own.__wrapped__, static_argnums=STATIC[name])
+
+    def __call__(self, *args):
+        concrete = is_concrete(*jax.tree.leaves(args))
+        return (self.quick if concrete else self.own)(*args)
+
+    def _cache_size(self) -> int:
+        return self.own._cache_size() + self.quick._cache_size()
+
+
+@functools.cache
+def verbs() -> dict[str, Verb]:
+    """Made once, so that all modules share what is compiled."""
+    return {name: Verb(name) for name in STATIC}

@@ -1,0 +1,166 @@
+"""The k-buffer against ray casting: the same segments, whatever the mesh and the rays."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+import jaxvr
+from jaxvr._core import status as bits
+from jaxvr.trace import stream
+from jaxvr.volume import datasets
+
+ENOUGH = 64  # more than any ray here has fragments
+SIZE = 8
+
+
+@functools.cache
+def fins():
+    """Not convex, with gaps that rays cross."""
+    return datasets.heat_sink(fins=2, dtype="float64")
+
+
+@functools.cache
+def transfer():
+    return jaxvr.TransferFunction(
+        [0.0, 0.4, 0.4, 1.0], np.eye(4)[:, :3], [0.5, 3.0, 1.0, 2.0], dtype="float64"
+    )
+
+
+def scaled(mesh):
+    """Values from 0 to 1, so that one transfer function serves."""
+    values = np.asarray(mesh.values)
+    return mesh.replace(values=(values - values.min()) / np.ptp(values))
+
+
+def rays_of(view: str):
+    """64 rays: through the mesh from outside, from inside of it, side by side, or without order."""
+    mesh = fins()
+    lo, hi = (np.asarray(x) for x in mesh.bounds())
+    middle, reach = (lo + hi) / 2, np.linalg.norm(hi - lo)
+    rng = np.random.default_rng(4)
+    towards = rng.normal(size=(SIZE, SIZE, 3))
+    if view == "unordered":
+        return middle + reach * towards, -towards + 0.2 * rng.normal(size=towards.shape)
+    if view == "sphere":  # too wide for a plane across it
+        return np.broadcast_to(middle + 0.01, towards.shape), towards
+    size = {"width": SIZE, "height": SIZE, "dtype": "float64"}
+    if view == "outside":
+        return jaxvr.Camera.orbit(mesh, 20, 30, zoom=1.5, **size).rays()
+    if view == "inside":
+        cell = np.asarray(mesh.points)[np.asarray(mesh.cells)[7]].mean(0)
+        return jaxvr.Camera.look_at(cell, middle + 0.01, fov=90, **size).rays()
+    return jaxvr.Camera.orthographic(middle, lo - 0.1, extent=0.7 * reach, **size).rays()
+
+
+@pytest.mark.parametrize("view", ["outside", "inside", "parallel", "sphere", "unordered"])
+def test_same_as_ray_casting(view):
+    rays = rays_of(view)
+    exact = jaxvr.render_rays(scaled(fins()), *rays, transfer())
+    tracer = jaxvr.KBuffer(k=ENOUGH)
+    found, status = jaxvr.render_rays(scaled(fins()), *rays, transfer(), tracer=tracer, status=True)
+    assert not np.asarray(status).any()
+    assert np.asarray(exact)[..., 3].max() > 0.2
+    assert np.allclose(found, exact, atol=1e-13)
+
+
+@pytest.mark.parametrize("direction", ["front to back", "back to front"])
+@pytest.mark.parametrize("pairs", ["cells", "closest"])
+def test_both_ways_to_pair_and_to_composite(pairs, direction):
+    rays = rays_of("outside")
+    exact = jaxvr.render_rays(scaled(fins()), *rays, transfer())
+    found = jaxvr.render_rays(
+        *(scaled(fins()), *rays, transfer()),
+        tracer=jaxvr.KBuffer(k=ENOUGH, pairs=pairs, order=jaxvr.order.FirstVertex()),
+        compositor=jaxvr.Over(direction=direction),
+    )
+    assert np.allclose(found, exact, atol=1e-13)
+
+
+def test_rays_end_early_at_the_same_places():
+    rays, over = rays_of("outside"), jaxvr.Over(termination=0.5)
+    exact = jaxvr.render_rays(scaled(fins()), *rays, transfer(), compositor=over)
+    found = jaxvr.render_rays(
+        scaled(fins()), *rays, transfer(), compositor=over, tracer=jaxvr.KBuffer(k=ENOUGH)
+    )
+    assert np.allclose(found, exact, atol=1e-13)
+
+
+def test_a_small_k_tells_which_pixels_are_wrong():
+    mesh = scaled(fins())
+    camera = jaxvr.Camera.orbit(mesh, 20, 30, zoom=1.5, width=16, height=16, dtype="float64")
+    exact = np.asarray(jaxvr.render(mesh, camera, transfer()))
+    image, status = jaxvr.render(mesh, camera, transfer(), tracer=jaxvr.KBuffer(k=1), status=True)
+    wrong = np.abs(np.asarray(image) - exact).max(-1) > 1e-12
+    told = (np.asarray(status) & bits.K_TOO_SMALL) != 0
+    assert 0 < wrong.sum() < wrong.size and not (wrong & ~told).any()
+    # No more is said than the map of needed entries says.
+    assert not (told & (jaxvr.measure_k(mesh, camera).entries <= 1)).any()
+    with pytest.raises(jaxvr.RenderError, match="needed a k-buffer with more entries.*measure_k"):
+        jaxvr.render(mesh, camera, transfer(), tracer=jaxvr.KBuffer(k=1))
+
+
+def test_exact_order_needs_one_entry():
+    mesh = scaled(fins())
+    camera = jaxvr.Camera.orbit(mesh, 20, 30, zoom=1.5, width=16, height=16, dtype="float64")
+    order = jaxvr.order.exact_order(mesh, camera)
+    assert jaxvr.measure_k(mesh, camera, order=order).k == 1
+    found = jaxvr.render(mesh, camera, transfer(), tracer=jaxvr.KBuffer(k=1, order=order))
+    assert np.allclose(found, jaxvr.render(mesh, camera, transfer()), atol=1e-13)
+
+
+def test_faces_are_selected_in_bounded_lists(monkeypatch):
+    """Many windows over the sorted faces, and chunks of them, instead of one."""
+    mesh = datasets.box((5, 5, 5), jitter=0.2, dtype="float32", shuffle=True)
+    camera = jaxvr.Camera.orbit(mesh, 20, 30, width=8, height=8)
+    tf = jaxvr.TransferFunction([0.0, 1.0], np.eye(3)[:2], [1.0, 2.0], dtype="float32")
+    exact = jaxvr.render(mesh, camera, tf)
+    monkeypatch.setattr(stream, "LIST", 2 * stream.LOOK * stream.BLOCK)
+    monkeypatch.setattr(stream, "BITS", 1)
+    tracer = jaxvr.KBuffer(k=ENOUGH + 1)  # one that no other test has compiled
+    state = jax.eval_shape(lambda: _start(tracer, mesh, camera))
+    assert state.stream.selection.faces.shape == (2048, 2)
+    assert state.stream.masks.shape[0] == 1
+    assert mesh.n_tets * 2 > 1024  # a list holds less than all faces
+    assert np.allclose(jaxvr.render(mesh, camera, tf, tracer=tracer), exact, atol=1e-6)
+
+
+def _start(tracer, mesh, camera):
+    scene = tracer.prepare(mesh)
+    rays = tracer.prepare_rays(scene, *(x.reshape(-1, 3) for x in camera.rays()))
+    return tracer.start(scene, rays)
+
+
+def test_boundaries_that_touch():
+    """Two boxes side by side whose triangulations do not match: a ray leaves one and enters the
+    other at the same depth, in an order that rounding decides."""
+    one = datasets.box((2, 2, 2), jitter=0.1, seed=1, dtype="float64")
+    two = datasets.box((3, 3, 3), jitter=0.1, seed=2, dtype="float64")
+    points = [np.asarray(m.points) + [i, 0, 0] for i, m in enumerate((one, two))]
+    cells = [np.asarray(one.cells), np.asarray(two.cells) + len(points[0])]
+    values = np.concatenate([one.values, 1 - np.asarray(two.values)])
+    with pytest.warns(UserWarning, match="inverted"):  # rows are sorted, not oriented
+        mesh = jaxvr.TetMesh.from_cells(
+            np.concatenate(points), {"tetra": np.concatenate(cells)}, values, dtype="float64"
+        )
+    camera = jaxvr.Camera.look_at((4, 1.1, 0.8), (1, 0.5, 0.5), fov=30, width=8, height=8)
+    camera = jax.tree.map(lambda x: x.astype("float64"), camera)
+    found = jaxvr.render(mesh, camera, transfer(), tracer=jaxvr.KBuffer(k=ENOUGH))
+    assert np.allclose(found, jaxvr.render(mesh, camera, transfer()), atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"k": 0}, "k must be a positive integer, but is 0"),
+        ({"k": 2.5}, "k must be a positive integer"),
+        ({"order": "centroid"}, r"such as jaxvr.order.Centroid\(\), but is 'centroid'"),
+        ({"pairs": "nearest"}, 'must be "cells" or "closest"'),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        jaxvr.KBuffer(**arguments)
