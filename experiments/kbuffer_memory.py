@@ -44,7 +44,6 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, k: int) -> dict[str, Any]:
     row["reserved"] = reserved(volume, size, tracer, None)
     row["with 64 KiB for rays"] = reserved(volume, size, tracer, BUDGET)
     row["small mesh"] = reserved(small, size, tracer, None)
-    row["small mesh, 64 KiB"] = reserved(small, size, tracer, BUDGET)
     row["peak before"] = peak()
     camera, transfer = viewpoints(volume, size)[-1], transfer_of(volume)
     jax.block_until_ready(jaxvr.render(volume, camera, transfer, tracer=tracer, status=True))

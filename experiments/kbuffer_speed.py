@@ -26,7 +26,7 @@ from experiments.havs import options, viewpoints, volumes
 @jax.jit
 def sort_by_centroid(points: Any, faces: Any, eye: Any) -> Any:
     """The order (F,) of faces (F, 3)."""
-    away = points[faces].mean(1) - eye
+    away = points[faces].mean(1) - eye[None]
     return jnp.argsort(jnp.sum(away * away, axis=1))
 
 
@@ -34,7 +34,7 @@ def sort_by_centroid(points: Any, faces: Any, eye: Any) -> Any:
 def sort_by_first_vertex(points: Any, first: Any, starts: Any, eye: Any) -> Any:
     """The same, for faces that are grouped by their first vertex: `first` (F,) its id and `starts`
     (P + 1,) where each vertex's faces begin."""
-    away = points - eye
+    away = points - eye[None]
     order = jnp.argsort(jnp.sum(away * away, axis=1))
     count = (starts[1:] - starts[:-1])[order]
     ends = jnp.cumsum(count)

@@ -18,6 +18,12 @@ from experiments import (
     fit_transfer,
     full_vs_partial,
     integrators,
+    k_requirements,
+    kbuffer_exact,
+    kbuffer_memory,
+    kbuffer_refine,
+    kbuffer_speed,
+    kbuffer_stages,
     layouts,
     limits,
     log_table,
@@ -133,7 +139,50 @@ def limits_cells(folder: Path) -> float:
     return report["meshes"][0]["cells a ray"]
 
 
+def k_requirements_entries(folder: Path) -> float:
+    report = k_requirements.main(["--tiny", "--views", "2", "--out", str(folder)])
+    assert (folder / "k_box_first_vertex.png").stat().st_size > 0
+    assert {row["order"] for row in report["rows"]} == {"centroid", "first vertex"}
+    return report["rows"][0]["entries"]
+
+
+def kbuffer_exact_error(folder: Path) -> float:
+    """The largest error with as many entries as are needed; fewer are told."""
+    rows = kbuffer_exact.main(["--tiny"])["rows"]
+    assert all(row["untold"] == 0 for row in rows)
+    enough = [row for row in rows if row["k"] >= row["needed"]]
+    assert max(row["gradient"] for row in enough if row["dtype"] == "float64") < 1e-10
+    return max(row["error"] for row in enough) + 1e-9
+
+
+def kbuffer_speed_rate(folder: Path) -> float:
+    (row,) = kbuffer_speed.main(["--tiny"])["rows"]
+    return row["k = 6"] / row["k = 2"]
+
+
+def kbuffer_stages_share(folder: Path) -> float:
+    rows = kbuffer_stages.main(["--tiny"])["rows"]
+    return sum(row["share"] for row in rows if row["share"] is not None)
+
+
+def kbuffer_memory_bytes(folder: Path) -> float:
+    (row,) = kbuffer_memory.main(["--tiny"])["rows"]
+    return row["reserved"] / row["with 64 KiB for rays"]
+
+
+def kbuffer_refine_change(folder: Path) -> float:
+    rows = kbuffer_refine.main(["--tiny"])["rows"]
+    assert rows[1]["tets"] > rows[0]["tets"]
+    return max(row["change"] for row in rows)
+
+
 EXPERIMENTS = [
+    (k_requirements_entries, 1, 10),
+    (kbuffer_exact_error, 1e-10, 1e-5),
+    (kbuffer_speed_rate, 0.1, 10),
+    (kbuffer_stages_share, 0.9, 1.1),
+    (kbuffer_memory_bytes, 0.9, 10),
+    (kbuffer_refine_change, 1e-9, 1e-5),
     (demo_psnr, 25, 200),
     (fit_transfer_psnr, 25, 200),
     (preintegration_build_gain, 1.2, 20),

@@ -342,9 +342,8 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
     size = how.k + 1
     give = go & ((count == size) | (done & (count > 0)))
     wanted = jnp.any(give)
-    pair = stage(
-        wanted, lambda *x: _choose_pair(*x, how), lax.stop_gradient(buffer.depth), buffer.words
-    )
+    depth = lax.stop_gradient(buffer.depth)
+    pair = stage(wanted, lambda d, w: _choose_pair(d, w, how), depth, buffer.words)
     first = jax.tree.map(lambda rows: _pick(pair.first, rows), buffer)
     second = jax.tree.map(lambda rows: _pick(pair.second, rows), buffer)
     found = give & pair.found

@@ -310,8 +310,8 @@ def pull_back_pair(
             none = _Pulled(*(jnp.zeros_like(x) for x in q))
             shares = [(share, jnp.zeros_like(share)) for share in end.share]
             coordinates = _to_points(coordinates, rays, end.ids, shares, q, none)
-    both = zip(pulled, (end.at for end in ends), strict=True)
-    return (values, coordinates), _to_rays(by_rays, rays, *both, stretch_bar)
+    near, far = zip(pulled, (end.at for end in ends), strict=True)
+    return (values, coordinates), _to_rays(by_rays, rays, near, far, stretch_bar)
 
 
 class _End(NamedTuple):

@@ -110,7 +110,8 @@ def _measure(
     size, dtype = origins.shape[1], origins.dtype
 
     def one(inputs):
-        rays = beam_rays(*inputs, source.scene.scale)
+        origins, directions = inputs
+        rays = beam_rays(origins, directions, source.scene.scale)
         stream, sort = start_stream(source, size), Sort(order)
         integer = jnp.zeros(size, jnp.int32)
         far = jnp.full(size, jnp.inf, dtype)

@@ -222,7 +222,8 @@ def _count(sort: Sort, source: Triangles, rays: Any) -> Array:
     rays, count = batches(_size(source), rays)
 
     def one(inputs):
-        batch = beam_rays(*inputs, source.scale)
+        origins, directions = inputs
+        batch = beam_rays(origins, directions, source.scale)
         zero = jnp.zeros(batch.origins.shape[1], jnp.int32)
         return _walk(sort, source, batch, zero, lambda n, new: n + new.hit.astype(jnp.int32))
 

@@ -198,7 +198,7 @@ def _select(sort: Sort) -> Any:
         # Behind the last face of the selection before, and before the first that was left out.
         last = old.faces[jnp.maximum(old.count - 1, 0)]
         none = old.count == 0
-        floor = tuple(jnp.where(none, x, y) for x, y in zip(old.last, last, strict=True))
+        floor = jnp.where(none, old.last[0], last[0]), jnp.where(none, old.last[1], last[1])
         ceiling = (jnp.full((), _INT.max, jnp.int32),) * 2
 
         def body(loop):

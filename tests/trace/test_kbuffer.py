@@ -13,6 +13,8 @@ from jaxvr._core import status as bits
 from jaxvr.trace import stream
 from jaxvr.volume import datasets
 
+pytestmark = pytest.mark.usefixtures("quick_code")
+
 ENOUGH = 64  # more than any ray here has fragments
 SIZE = 8
 
@@ -70,10 +72,10 @@ def test_same_as_ray_casting(view):
 @pytest.mark.parametrize("direction", ["front to back", "back to front"])
 @pytest.mark.parametrize("pairs", ["cells", "closest"])
 def test_both_ways_to_pair_and_to_composite(pairs, direction):
-    rays = rays_of("outside")
-    exact = jaxvr.render_rays(scaled(fins()), *rays, transfer())
+    origins, directions = rays_of("outside")
+    exact = jaxvr.render_rays(scaled(fins()), origins, directions, transfer())
     found = jaxvr.render_rays(
-        *(scaled(fins()), *rays, transfer()),
+        *(scaled(fins()), origins, directions, transfer()),
         tracer=jaxvr.KBuffer(k=ENOUGH, pairs=pairs, order=jaxvr.order.FirstVertex()),
         compositor=jaxvr.Over(direction=direction),
     )

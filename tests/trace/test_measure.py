@@ -9,6 +9,8 @@ import jaxvr
 from jaxvr.order import entries_needed, moved
 from jaxvr.volume import datasets
 
+pytestmark = pytest.mark.usefixtures("quick_code")
+
 FACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
