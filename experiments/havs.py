@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import jaxvr
-from experiments.common import diagonal, read_volume
+from experiments.common import diagonal, machine, read_volume, write_json
 
 ORDERS = {"centroid": jaxvr.order.Centroid(), "first vertex": jaxvr.order.FirstVertex()}
 
@@ -65,4 +65,13 @@ def volumes(found: argparse.Namespace) -> dict[str, jaxvr.TetMesh]:
     for given in found.meshes:
         path, _, field = given.partition(":")
         out[Path(path).stem] = read_volume(path, field or None)
+    return out
+
+
+def report(found: argparse.Namespace, rows: Any, *names: str) -> dict[str, Any]:
+    """Machine, size, the options of these names and the numbers; written where --json says."""
+    out = {"machine": machine(), "size": found.size}
+    out |= {name: getattr(found, name) for name in names} | {"rows": rows}
+    if found.json:
+        write_json(found.json, out)
     return out

@@ -20,8 +20,8 @@ import numpy as np
 from matplotlib.image import imsave
 
 import jaxvr
-from experiments.common import machine, table, write_json
-from experiments.havs import ORDERS, options, viewpoints, volumes
+from experiments.common import table
+from experiments.havs import ORDERS, options, report, viewpoints, volumes
 
 # For people who see red and green alike they differ in lightness too.
 COLORS = np.array([[0, 0, 0], [20, 120, 60], [250, 210, 40], [200, 20, 30]], np.uint8)
@@ -67,10 +67,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     for name, volume in volumes(found).items():
         rows += run(volume, name, found.size, found.views, found.orders, found.out)
     print(table(rows))
-    report = {"machine": machine(), "size": found.size, "views": found.views, "rows": rows}
-    if found.json:
-        write_json(found.json, report)
-    return report
+    return report(found, rows, "views")
 
 
 if __name__ == "__main__":

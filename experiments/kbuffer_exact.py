@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvr
-from experiments.common import in_float64, machine, table, transfer_of, write_json
-from experiments.havs import options, viewpoints, volumes
+from experiments.common import in_float64, table, transfer_of
+from experiments.havs import options, report, viewpoints, volumes
 
 
 def gradients(volume: Any, camera: Any, transfer: Any, tracer: Any, weights: Any) -> Any:
@@ -82,10 +82,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
             rows += compare(volume, name, camera, smaller=True)
         rows += compare(in_float64(volume), name, in_float64(camera), smaller=False)
     print(table(rows))
-    report = {"machine": machine(), "size": found.size, "rows": rows}
-    if found.json:
-        write_json(found.json, report)
-    return report
+    return report(found, rows)
 
 
 if __name__ == "__main__":

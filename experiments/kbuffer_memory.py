@@ -17,8 +17,8 @@ from typing import Any
 import jax
 
 import jaxvr
-from experiments.common import machine, read_volume, table, transfer_of, write_json
-from experiments.havs import options, viewpoints, volumes
+from experiments.common import read_volume, table, transfer_of
+from experiments.havs import options, report, viewpoints, volumes
 
 BUDGET = 1 << 16
 
@@ -56,10 +56,7 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, k: int) -> dict[str, Any]:
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     found = options(__doc__, arguments, k=6)
     rows = [run(volume, name, found.size, found.k) for name, volume in volumes(found).items()]
-    report = {"machine": machine(), "size": found.size, "k": found.k, "rows": rows}
-    if found.json:
-        write_json(found.json, report)
-    return report
+    return report(found, rows, "k")
 
 
 if __name__ == "__main__":

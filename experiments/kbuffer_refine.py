@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 import jaxvr
-from experiments.common import machine, table, transfer_of, write_json
-from experiments.havs import ORDERS, options, viewpoints, volumes
+from experiments.common import table, transfer_of
+from experiments.havs import ORDERS, options, report, viewpoints, volumes
 
 
 def run(volume: jaxvr.TetMesh, name: str, size: int, views: int, shares: list[float]):
@@ -49,10 +49,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     for name, volume in volumes(found).items():
         rows += run(volume, name, found.size, found.views, found.shares)
     print(table(rows))
-    report = {"machine": machine(), "size": found.size, "views": found.views, "rows": rows}
-    if found.json:
-        write_json(found.json, report)
-    return report
+    return report(found, rows, "views")
 
 
 if __name__ == "__main__":

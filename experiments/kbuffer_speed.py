@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvr
-from experiments.common import machine, seconds_of, table, transfer_of, write_json
-from experiments.havs import options, viewpoints, volumes
+from experiments.common import seconds_of, table, transfer_of
+from experiments.havs import options, report, viewpoints, volumes
 
 
 @jax.jit
@@ -96,10 +96,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         run(volume, name, found.size, found.views, found.repeat)
         for name, volume in volumes(found).items()
     ]
-    report = {"machine": machine(), "size": found.size, "views": found.views, "rows": rows}
-    if found.json:
-        write_json(found.json, report)
-    return report
+    return report(found, rows, "views")
 
 
 if __name__ == "__main__":

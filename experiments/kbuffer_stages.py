@@ -19,8 +19,8 @@ import numpy as np
 from jax import lax
 
 import jaxvr
-from experiments.common import machine, median_of, table, transfer_of, write_json
-from experiments.havs import options, viewpoints, volumes
+from experiments.common import median_of, table, transfer_of
+from experiments.havs import options, report, viewpoints, volumes
 from jaxvr.trace import stream as streams
 from jaxvr.trace.entry import search
 from jaxvr.trace.rasterize import triangle_source
@@ -160,10 +160,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     rows = []
     for name, volume in volumes(found).items():
         rows += run(volume, name, found.size, found.k, found.repeat)
-    report = {"machine": machine(), "size": found.size, "k": found.k, "rows": rows}
-    if found.json:
-        write_json(found.json, report)
-    return report
+    return report(found, rows, "k")
 
 
 if __name__ == "__main__":
