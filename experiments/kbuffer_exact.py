@@ -81,6 +81,8 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         if not found.tiny:
             rows += compare(volume, name, camera, smaller=True)
         rows += compare(in_float64(volume), name, in_float64(camera), smaller=False)
+        # Compiled code takes memory maps, of which Linux allows a process 65,530.
+        jax.clear_caches()
     print(table(rows))
     return report(found, rows)
 

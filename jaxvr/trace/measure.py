@@ -60,6 +60,9 @@ def measure_k(volume: TetMesh, camera: Camera, *, order: AbstractOrder | None = 
     Returns:
       a `KMap`. An image with `KBuffer(k=map.k, order=order)` is right everywhere.
 
+    Where a mesh is folded or overlaps itself, a fragment may have to stay for a second segment, and
+    an entry more may be needed: the status of the image has the last word.
+
     Fragments at the same depth to rounding (a ray through an edge) count as out of order, whichever
     comes first. Not for use inside `jit`: how much there is to remember is only known afterwards.
     """
