@@ -34,6 +34,7 @@ import jax.numpy as jnp
 
 import jaxvr
 from jaxvr.volume import read_mesh
+from jaxvr.volume.connectivity import FACES
 from tests.reference import Reference
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -84,7 +85,7 @@ def _inner_faces(mesh: Any) -> np.ndarray:
     omitted = np.tile(np.arange(4), mesh.n_tets)
     inner = np.asarray(mesh.neighbors).ravel() >= 0
     cells, omitted = cells[inner], omitted[inner]
-    kept = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[omitted]
+    kept = FACES[omitted]
     return 4 * cells[:, None] + kept
 
 

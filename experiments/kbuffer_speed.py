@@ -21,6 +21,8 @@ import numpy as np
 import jaxvr
 from experiments.common import seconds_of, table, transfer_of
 from experiments.havs import options, report, viewpoints, volumes
+from jaxvr.volume import packing
+from jaxvr.volume.connectivity import FACES
 
 
 @jax.jit
@@ -47,8 +49,10 @@ def sort_by_first_vertex(points: Any, first: Any, starts: Any, eye: Any) -> Any:
 def faces_of(volume: jaxvr.TetMesh) -> np.ndarray:
     """All faces (F, 3), each once."""
     cells, words = np.asarray(volume.cells), np.asarray(volume.neighbors)
-    cell, corner = np.nonzero((words < 0) | ((words >> 4) > np.arange(len(cells))[:, None]))
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[corner]
+    cell, corner = np.nonzero(
+        (words < 0) | (packing.cell_of(words) > np.arange(len(cells))[:, None])
+    )
+    others = FACES[corner]
     return cells[cell[:, None], others]
 
 

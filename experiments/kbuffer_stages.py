@@ -24,10 +24,11 @@ from experiments.havs import options, report, viewpoints, volumes
 from jaxvr.trace import stream as streams
 from jaxvr.trace.entry import search
 from jaxvr.trace.rasterize import triangle_source
-from jaxvr.view.tiles import TILE, batches, tile
+from jaxvr.view.tiles import batch_size, batches, tile
 from jaxvr.volume import packing
+from jaxvr.volume.connectivity import FACES
 
-SIZE = TILE[0] * TILE[1]
+SIZE = batch_size("float32")
 
 
 def _tiles(camera: jaxvr.Camera) -> Any:
@@ -44,7 +45,7 @@ def _select(scene: Any, rays: Any, sort: Any) -> Any:
     return _selected(scene, rays, sort).selection.count
 
 
-def _sort_only(scene: Any, rays: Any, count: Any, sort: Any) -> Any:
+def _sort_only(scene: Any, count: Any) -> Any:
     """Sorts lists as long as those of the tiles, in no order before."""
     size = streams.start_stream(scene, SIZE).selection.faces.shape[0]
     number = jnp.arange(size, dtype=jnp.int32)
@@ -65,19 +66,12 @@ def _cover(scene: Any, rays: Any, sort: Any) -> Any:
 
 
 def _fragments(scene: Any, rays: Any, sort: Any) -> Any:
-    def going(loop):
-        return ~(streams.over(loop[0]) & jnp.all(streams.drawn(loop[0])))
+    def add(sums, new):
+        total, depth = sums
+        return total + new.hit, depth + jnp.where(new.hit, new.at.z + new.at.value, 0)
 
-    def body(loop):
-        stream, total, depth = loop
-        stream = streams.refill(stream, jnp.all(streams.drawn(stream)), scene, rays, sort)
-        go = jnp.ones(SIZE, bool)
-        stream, new = streams.next_fragments(stream, scene, rays.sheared, go)
-        return stream, total + new.hit, depth + jnp.where(new.hit, new.at.z + new.at.value, 0)
-
-    zero = jnp.zeros(SIZE, jnp.int32)
-    loop = (streams.start_stream(scene, SIZE), zero, jnp.zeros(SIZE, rays.origins.dtype))
-    return lax.while_loop(going, body, loop)[1:]
+    zero = jnp.zeros(SIZE, jnp.int32), jnp.zeros(SIZE, rays.origins.dtype)
+    return streams.draw(scene, rays, sort, zero, add)
 
 
 def _walk(scene: Any, rays: Any, tracer: jaxvr.KBuffer) -> Any:
@@ -113,9 +107,9 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, k: int, repeat: int) -> lis
     cast = jax.jit(caster.prepare)(volume)
     cast_rays = jax.jit(jax.vmap(partial(caster.prepare_rays, cast)))(*_tiles(camera))
     search_all = jax.jit(lambda s, rays: lax.map(lambda r: _entries(caster, s, r), rays))
-    sort_all = jax.jit(lambda s, c: lax.map(lambda n: _sort_only(s, None, n, sort), c))
+    sort_all = jax.jit(lambda s, c: lax.map(lambda n: _sort_only(s, n), c))
     words = np.asarray(volume.boundary)
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[packing.corner_of(words)]
+    others = FACES[packing.corner_of(words)]
     boundary = np.asarray(volume.cells)[packing.cell_of(words)[:, None], others]
     values = jnp.zeros(volume.n_points, volume.dtype)
     surface = triangle_source(volume.points, values, jnp.asarray(boundary))

@@ -51,14 +51,15 @@ from experiments.common import camera_of, diagonal, median_of, read_volume, tabl
 from jaxvr._core import status as bits
 from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment
-from jaxvr.render import BATCH
 from jaxvr.trace.entry import build_boxes, no_entries, search
 from jaxvr.trace.face import Face, choose, opposite_edges, sizes_of
 from jaxvr.trace.local import edges_to_apex, exit_face, leave_by
 from jaxvr.trace.scene import entry_corners, make_scene, merged_points
 from jaxvr.trace.shear import ShearedRays, shear_points, shear_rays
-from jaxvr.view.tiles import TILE
+from jaxvr.view import tiles
 from jaxvr.volume import packing
+
+BATCH = tiles.batch_size("float32")
 
 Array = jax.Array
 
@@ -424,8 +425,7 @@ def welded(mesh: jaxvr.TetMesh) -> jaxvr.TetMesh:
 
 def rays_of(camera: jaxvr.Camera) -> tuple[Array, Array]:
     """Origins and directions (R, 3), tile after tile as in `jaxvr.render`."""
-    row, column = (x.ravel() for x in np.mgrid[: camera.height, : camera.width])
-    order = np.lexsort((column, row, column // TILE[1], row // TILE[0]))
+    order = tiles.tile_order(camera.height, camera.width)
     origins, directions = (x.reshape(-1, 3)[order] for x in camera.rays())
     return origins, directions
 

@@ -2,8 +2,8 @@
 
     volume, camera -- tracer --> segments -- integrator --> colours -- compositor --> pixels
 
-`render` is `shade(trace(...))` without storing the segments. Rays go in batches of `BATCH`, square
-tiles of the image, so that the rays of a batch stay together. Integers and floats of volume,
+`render` is `shade(trace(...))` without storing the segments. Rays go in batches, square tiles
+of the image, so that the rays of a batch stay together. Integers and floats of volume,
 camera and transfer function are arguments of one compiled function: a new camera, transfer
 function or field does not compile again, a new mesh size, image size or number of control points
 does.
@@ -30,15 +30,11 @@ from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
 from jaxvr.trace import AbstractTracer, RayCast, Recorded, Segments
 from jaxvr.trace.recorded import fill, record
 from jaxvr.view.camera import Camera
-from jaxvr.view.tiles import TILE, batches, tile, tile_order, untile
+from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
 from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
 
-# Rays of a batch in float32, a tile of the image: enough to hide the cost of starting a kernel, few
-# enough that they take about as many steps and their state stays in cache. In float64 half as many:
-# XLA hands larger kernels to several threads, at a loss.
-BATCH = TILE[0] * TILE[1]
 # Accelerators want many more at once; not measured yet.
 ACCELERATOR_BATCH = 1 << 18
 # Numbers that XLA keeps for each ray of a batch: 89 to render, 207 for all gradients at once
@@ -302,12 +298,12 @@ def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):
 
 def _batch_size(budget: Any, volume: Any) -> int:
     """Rays that march at once."""
-    itemsize = np.dtype(_dtype_of(volume)).itemsize
+    dtype = np.dtype(_dtype_of(volume))
     if budget is None:
-        return BATCH * 4 // itemsize if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
+        return batch_size(dtype) if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
     if not isinstance(budget, int | float | np.number) or not 1 <= budget < math.inf:
         raise ValueError(f"budget must be a number of bytes, at least 1, but is {budget!r}.")
-    return max(int(budget) // (NUMBERS_PER_RAY * itemsize), 1)
+    return max(int(budget) // (NUMBERS_PER_RAY * dtype.itemsize), 1)
 
 
 def _over(rgba: Array, background: Array | None) -> Array:

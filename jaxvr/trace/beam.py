@@ -83,19 +83,30 @@ def _apply(axes: Array, points: Array) -> Array:
     return jnp.stack([a[0] * x + a[1] * y + a[2] * z for a in axes])
 
 
-def sides(beam: Beam) -> tuple[Array, Array, Array]:
-    """Half spaces (4,) round the beam: n . q + c >= 0 for all q from the origin that its rays meet
-    ahead of them, with normals n (4, 3) and c (4,); and the slack (4,) for each unit of |q|."""
+class Sides(NamedTuple):
+    """Half spaces (4,) round a beam: n . q + c >= 0 for all q from its origin that its rays meet
+    ahead of them. normals (4, 3), offsets (4,), and slack () for each unit of |q|."""
+
+    normals: Array
+    offsets: Array
+    slack: Array
+
+
+def sides(beam: Beam) -> Sides:
+    """All of space, for a beam that is not narrow."""
     right, up, forward = beam.axes
-    zero = jnp.zeros((), right.dtype)
     normals, offsets = [], []
     for axis, bound, sign in ((right, 0, 1), (right, 0, -1), (up, 1, 1), (up, 1, -1)):
         at = (beam.low if sign > 0 else beam.high)[bound]
         normals.append(sign * jnp.where(beam.pinhole, axis - at * forward, axis))
-        offsets.append(jnp.where(beam.pinhole, zero, -sign * at))
+        offsets.append(jnp.where(beam.pinhole, 0, -sign * at))
     reach = 1 + jnp.max(jnp.abs(beam.place))
-    slack = jnp.full(4, 2 * ROUNDINGS * jnp.finfo(right.dtype).eps) * reach
-    return jnp.stack(normals), jnp.stack(offsets), slack
+    slack = 2 * ROUNDINGS * jnp.finfo(right.dtype).eps * reach
+    return Sides(
+        jnp.where(beam.narrow, jnp.stack(normals), 0),
+        jnp.where(beam.narrow, jnp.stack(offsets), 1),
+        slack,
+    )
 
 
 def meets_boxes(beam: Beam, low: Array, high: Array) -> Array:
@@ -104,24 +115,23 @@ def meets_boxes(beam: Beam, low: Array, high: Array) -> Array:
     middle, half = 0.5 * (low + high) - beam.origin[:, None], 0.5 * (high - low)
     size = jnp.sum(jnp.abs(middle) + half, axis=0)
     met = jnp.ones(low.shape[1:], bool)
-    for normal, offset, margin in zip(normals, offsets, slack, strict=True):
+    for normal, offset in zip(normals, offsets, strict=True):
         farthest = offset + sum(
             n * m + jnp.abs(n) * h for n, m, h in zip(normal, middle, half, strict=True)
         )
-        met = met & (farthest >= -margin * (1 + size))
-    return met | ~beam.narrow
+        met = met & (farthest >= -slack * (1 + size))
+    return met
 
 
-def outside(beam: Beam, q: Array) -> Array:
-    """On which sides (4, ...) of the beam points q (3, ...), from its origin, surely lie."""
-    normals, offsets, slack = sides(beam)
+def outside(around: Sides, q: Array) -> Array:
+    """On which sides (4, ...) of a beam points q (3, ...), from its origin, surely lie."""
     x, y, z = q
     size = jnp.abs(x) + jnp.abs(y) + jnp.abs(z)
     out = [
-        n[0] * x + n[1] * y + n[2] * z + offset < -margin * (1 + size)
-        for n, offset, margin in zip(normals, offsets, slack, strict=True)
+        n[0] * x + n[1] * y + n[2] * z + offset < -around.slack * (1 + size)
+        for n, offset in zip(around.normals, around.offsets, strict=True)
     ]
-    return jnp.stack(out) & beam.narrow
+    return jnp.stack(out)
 
 
 class Outline(NamedTuple):

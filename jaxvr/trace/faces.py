@@ -13,7 +13,7 @@ from jax import lax
 
 from jaxvr._core.gather import take
 from jaxvr._core.pytree import pytree
-from jaxvr.trace.scene import Scene, entry_corners
+from jaxvr.trace.scene import Scene, coordinates_of, entry_corners
 from jaxvr.trace.stream import BLOCK
 from jaxvr.volume import packing
 
@@ -42,7 +42,7 @@ class CellFaces:
         word = take(self.scene.neighbors, slot)
         mine = (word < 0) | (packing.cell_of(word) > cell[None])
         ids = take(self.scene.cells, slot)
-        points = jnp.stack([take(self.scene.vertices, 4 * ids + axis) for axis in range(3)])
+        points = coordinates_of(self.vertices, ids)
         faces = [[j for j in range(4) if j != k] for k in range(4)]
         a, b, c = (
             jnp.concatenate([points[:, face[i]] for face in faces], axis=1) for i in range(3)
@@ -69,7 +69,7 @@ class CellFaces:
     def _round(self, origin: Array, cell: Array) -> Array:
         """Whether the boxes of cells (N,) contain a point (3,)."""
         ids = take(self.scene.cells, 4 * cell[None] + jnp.arange(4, dtype=jnp.int32)[:, None])
-        points = jnp.stack([take(self.scene.vertices, 4 * ids + axis) for axis in range(3)])
+        points = coordinates_of(self.vertices, ids)
         eye = origin[:, None]
         return jnp.all((points.min(1) <= eye) & (points.max(1) >= eye), axis=0)
 

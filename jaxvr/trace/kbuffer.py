@@ -37,9 +37,10 @@ from jax import lax
 from jaxvr._core import status as bits
 from jaxvr._core.gather import load, take
 from jaxvr._core.stage import stage
-from jaxvr.optics.partition import Segment
+from jaxvr.optics.partition import Segment, turned
 from jaxvr.order import AbstractOrder, Centroid
 from jaxvr.trace.base import AbstractTracer
+from jaxvr.trace.buffer import Entry, choose_pair, crossing_of, forget, on_side, pick, settle
 from jaxvr.trace.face import Crossing, barycentric
 from jaxvr.trace.faces import CellFaces, cell_faces
 from jaxvr.trace.local import (
@@ -52,7 +53,7 @@ from jaxvr.trace.local import (
 from jaxvr.trace.scene import Scene, entry_corners, longest_edge, make_scene, values_at
 from jaxvr.trace.stream import (
     BeamRays,
-    Fragments,
+    Hits,
     Sort,
     Stream,
     beam_rays,
@@ -61,24 +62,11 @@ from jaxvr.trace.stream import (
     over,
     refill,
     start_stream,
+    tolerance,
 )
 from jaxvr.volume import packing
 
 Array = jax.Array
-
-
-class Entry(NamedTuple):
-    """Fragments, (..., R) each; a buffer has k + 1 of them a ray, (..., k + 1, R).
-
-    depth (2, ...): a pair, from the eye; times -1 where the farthest comes first; infinite where
-    there is no fragment. values (V, ...): the scalar in each of the two cells that the face lies
-    between, or one for both. words (2, ...) int32: packed cell and corner of the face in each, -1
-    where there is none or where the segment in it has been given.
-    """
-
-    depth: Array
-    values: Array
-    words: Array
 
 
 class BufferState(NamedTuple):
@@ -202,7 +190,7 @@ class KBuffer(AbstractTracer):
 
     def pull_back(self, scene, rays, state, cotangent, gradient):
         if self.reverse:
-            cotangent = cotangent._replace(front=cotangent.back, back=cotangent.front)
+            cotangent = turned(cotangent)
         return pull_back_pair(
             scene.scene, rays.sheared, state.ends, state.active, cotangent, gradient
         )
@@ -221,14 +209,10 @@ def one_value(scene: Scene) -> bool:
     return scene.continuous and not scene.seams
 
 
-def _entry(scene: Scene, rays: BeamRays, new: Fragments, how: KBuffer) -> Entry:
+def _entry(scene: Scene, rays: BeamRays, new: Hits, how: KBuffer) -> Entry:
     """Fragments as entries of a buffer."""
-
-    def find(neighbors, slot):
-        return take(neighbors, slot)
-
     wanted = jnp.any(new.hit)
-    across = load(wanted, find, scene.neighbors, new.slot)
+    across = load(wanted, take, scene.neighbors, new.slot)
     # The turned and the seam bits are dropped.
     across = jnp.where(
         across < 0, -1, packing.pack(packing.cell_of(across), packing.corner_of(across))
@@ -239,7 +223,7 @@ def _entry(scene: Scene, rays: BeamRays, new: Fragments, how: KBuffer) -> Entry:
     return Entry(-depth if how.reverse else depth, values, words)
 
 
-def _values(scene: Scene, words: Array, new: Fragments, wanted: Array) -> Array:
+def _values(scene: Scene, words: Array, new: Hits, wanted: Array) -> Array:
     """The scalar (2, R) at fragments, as each of the two cells has it."""
     _, of_b, of_c = barycentric(new.face, new.weights)
     out = []
@@ -251,17 +235,11 @@ def _values(scene: Scene, words: Array, new: Fragments, wanted: Array) -> Array:
     return jnp.stack(out)
 
 
-def _tolerance(depth: Array, rays: BeamRays) -> Array:
-    """What rounding may do to a depth (R,)."""
-    eps = jnp.finfo(depth.dtype).eps
-    return 16 * eps * (jnp.abs(depth) + jnp.abs(lax.stop_gradient(rays.sheared.eye)))
-
-
 def _arrive(rays: BeamRays, state: BufferState, hit: Array, new: Entry, how: KBuffer):
     """Fragments (R,) that were hit take the last entry."""
     depth = lax.stop_gradient(new.depth[0])
     seen = depth <= 0 if how.reverse else depth >= 0
-    late = hit & seen & (depth < state.reach - _tolerance(depth, rays))
+    late = hit & seen & (depth < state.reach - tolerance(depth, rays.sheared))
     buffer = jax.tree.map(
         lambda rows, x: rows.at[..., -1, :].set(jnp.where(hit, x, rows[..., -1, :])),
         state.buffer,
@@ -269,70 +247,6 @@ def _arrive(rays: BeamRays, state: BufferState, hit: Array, new: Entry, how: KBu
     )
     status = state.status | jnp.where(late, bits.K_TOO_SMALL, 0).astype(jnp.int32)
     return state._replace(buffer=buffer, count=state.count + hit.astype(jnp.int32), status=status)
-
-
-class _Pair(NamedTuple):
-    """first, second: entries (R,) of a buffer by number; found (R,): whether there is a second.
-    mine, theirs (R,) int32: which of their two cells the segment is in."""
-
-    first: Array
-    second: Array
-    found: Array
-    mine: Array
-    theirs: Array
-
-
-def _least(depth: Array, valid: Array) -> Array:
-    """Number (R,) of the closest among valid entries (K, R)."""
-    high, low = depth
-    high = jnp.where(valid, high, jnp.inf)
-    tied = high == jnp.min(high, axis=0)[None]
-    return jnp.argmin(jnp.where(tied & valid, low, jnp.inf), axis=0).astype(jnp.int32)
-
-
-def _is(number: Array, size: int) -> Array:
-    """One-hot (K, R)."""
-    return jnp.arange(size, dtype=jnp.int32)[:, None] == number[None]
-
-
-def _pick(number: Array, rows: Array) -> Array:
-    """The entry (..., R) of a number (R,) from rows (..., K, R). By a sum, which is vectorised."""
-    chosen = _is(number, rows.shape[-2])
-    return jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=-2, dtype=rows.dtype)
-
-
-def _choose_pair(depth: Array, words: Array, how: KBuffer) -> _Pair:
-    """The first entry, and the one that makes a segment with it."""
-    used = jnp.isfinite(depth[0])
-    first = _least(depth, used)
-    rest = used & ~_is(first, used.shape[0])
-    # Cells are equal where words are, but for the corner.
-    ours, cells = packing.cell_of(_pick(first, words)), packing.cell_of(words)
-    shared = rest & _know(ours[:, None], cells)
-    second = _least(depth, rest if how.pairs == "closest" else shared)
-    found = jnp.any(rest if how.pairs == "closest" else shared, axis=0)
-    theirs = _pick(second, cells)
-    mine = jnp.where(_know(ours[:1], theirs), 0, 1).astype(jnp.int32)
-    same = jnp.where(mine == 0, ours[0], ours[1])
-    other = jnp.where((theirs[0] == same) & (same >= 0), 0, 1).astype(jnp.int32)
-    if how.pairs == "closest":  # they may have no cell in common: take the last side that exists
-        other = jnp.where(theirs[1] < 0, 0, other)
-        mine = jnp.where(ours[1] < 0, 0, mine)
-    return _Pair(first, second, found, mine, other)
-
-
-def _know(ours: Array, theirs: Array) -> Array:
-    """Whether any of our cells (N, ...) is one of theirs (2, ...)."""
-    known = [(a == b) & (a >= 0) for a in ours for b in theirs]
-    out = known[0]
-    for other in known[1:]:
-        out = out | other
-    return out
-
-
-def _side(which: Array, both: Array) -> Array:
-    """both[which], ray by ray; what all cells share if there is one for both."""
-    return both[0] if both.shape[0] == 1 else jnp.where(which == 0, both[0], both[1])
 
 
 def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuffer):
@@ -343,9 +257,9 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
     give = go & ((count == size) | (done & (count > 0)))
     wanted = jnp.any(give)
     depth = lax.stop_gradient(buffer.depth)
-    pair = stage(wanted, lambda d, w: _choose_pair(d, w, how), depth, buffer.words)
-    first = jax.tree.map(lambda rows: _pick(pair.first, rows), buffer)
-    second = jax.tree.map(lambda rows: _pick(pair.second, rows), buffer)
+    pair = stage(wanted, lambda d, w: choose_pair(d, w, how.pairs == "cells"), depth, buffer.words)
+    first = jax.tree.map(lambda rows: pick(pair.first, rows), buffer)
+    second = jax.tree.map(lambda rows: pick(pair.second, rows), buffer)
     found = give & pair.found
     inside, outside = found, state.outside
     if how.pairs == "closest":
@@ -353,22 +267,21 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
         inside = found & ~outside
         outside = jnp.where(found, inside & (second.words[1] < 0), outside)
 
-    ends = (_side(pair.mine, first.words), _side(pair.theirs, second.words))
+    ends = (on_side(pair.mine, first.words), on_side(pair.theirs, second.words))
     # Empty entries are infinitely far: guarded here, or 0 times that is the derivative.
     one, two = (
-        Crossing(*(jnp.where(found, x, 0) for x in _crossing(entry, side)))
-        for entry, side in ((first, pair.mine), (second, pair.theirs))
+        Crossing(*(jnp.where(found, x, 0) for x in crossing_of(entry, which)))
+        for entry, which in ((first, pair.mine), (second, pair.theirs))
     )
     if how.reverse:
         one, two = (c._replace(z=-c.z, z_low=-c.z_low) for c in (one, two))
-        segment = segment_between(two, one, rays.sheared.stretch)
-        segment, ends = segment._replace(front=segment.back, back=segment.front), ends[::-1]
+        segment, ends = turned(segment_between(two, one, rays.sheared.stretch)), ends[::-1]
     else:
         segment = segment_between(one, two, rays.sheared.stretch)
     given = inside & (segment.length > 0)
 
-    buffer, left, drop = _forget(buffer, first.words, pair, give, found, how)
-    buffer = _settle(buffer, pair.first, drop, go & ~give, count)
+    buffer, left, drop = forget(buffer, first.words, pair, give, found, how.pairs == "cells")
+    buffer = settle(buffer, pair.first, drop, go & ~give, count)
     count = count - drop.astype(jnp.int32)
     state = _account(rays, state, first, second, left, drop, how)
     finished = done & (count == 0)
@@ -393,45 +306,6 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
     )
 
 
-def _crossing(entry: Entry, side: Array) -> Crossing:
-    return Crossing(entry.depth[0], entry.depth[1], _side(side, entry.values))
-
-
-def _forget(buffer: Entry, words: Array, pair: _Pair, give: Array, found: Array, how: KBuffer):
-    """Both ends forget the cell of the segment that was given. An end that has another cell to give
-    a segment of stays for it. Returns the buffer, the cells (2, R) that the first entry has left,
-    and which rays drop it."""
-    if how.pairs == "closest":
-        return buffer, jnp.full_like(words, -1), give
-    side = jnp.arange(2, dtype=jnp.int32)[:, None]
-    left = jnp.where(found[None] & (side == pair.mine[None]), -1, words)
-    drop = give & ~(found & jnp.any(left >= 0, axis=0))
-    size = buffer.words.shape[1]
-    by_second = (_is(pair.second, size) & found[None])[None] & (side == pair.theirs[None])[:, None]
-    by_first = (_is(pair.first, size) & found[None])[None] & (side == pair.mine[None])[:, None]
-    return buffer._replace(words=jnp.where(by_first | by_second, -1, buffer.words)), left, drop
-
-
-def _settle(buffer: Entry, first: Array, drop: Array, filling: Array, count: Array) -> Entry:
-    """What arrived moves to the place of what is dropped, or to the next one that is free."""
-    size = buffer.words.shape[1]
-    place = jnp.where(drop, first, jnp.maximum(count - 1, 0))
-    move = drop | (filling & jnp.isfinite(buffer.depth[0, -1]))
-    target = _is(place, size) & move[None]
-    empty = Entry(
-        jnp.array([jnp.inf, 0], buffer.depth.dtype)[:, None],
-        jnp.zeros((1, 1), buffer.values.dtype),
-        jnp.full((1, 1), -1, jnp.int32),
-    )
-
-    def settle(rows, none):
-        moved = jnp.where(target[None], rows[:, -1:], rows)
-        last = jnp.where(move[None], jnp.broadcast_to(none, rows[:, -1].shape), moved[:, -1])
-        return moved.at[:, -1].set(last)
-
-    return jax.tree.map(settle, buffer, empty)
-
-
 def _account(rays: BeamRays, state: BufferState, first, second, left: Array, drop, how: KBuffer):
     """Status bits of rays that drop an entry with a cell left, whose segment is missing.
 
@@ -450,7 +324,7 @@ def _account(rays: BeamRays, state: BufferState, first, second, left: Array, dro
     cell = jnp.where(seen, cell, -1)
     owed, where = state.owed
     paid = (cell >= 0) & (cell == owed)
-    apart = paid & (jnp.abs(depth - where) > _tolerance(depth, rays))
+    apart = paid & (jnp.abs(depth - where) > tolerance(depth, rays.sheared))
     another = (cell >= 0) & ~paid & (owed >= 0)
     missing = both | apart | another
     owed = jnp.where(paid, -1, jnp.where(cell >= 0, cell, owed))

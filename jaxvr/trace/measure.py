@@ -21,9 +21,9 @@ from jaxvr._core.checks import is_concrete
 from jaxvr.order import AbstractOrder, Centroid
 from jaxvr.trace.faces import CellFaces, cell_faces
 from jaxvr.trace.scene import make_scene
-from jaxvr.trace.stream import Sort, beam_rays, drawn, next_fragments, over, refill, start_stream
+from jaxvr.trace.stream import Sort, beam_rays, draw, tolerance
 from jaxvr.view.camera import Camera
-from jaxvr.view.tiles import TILE, batches, tile, untile
+from jaxvr.view.tiles import batch_size, batches, tile, untile
 from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
@@ -74,10 +74,9 @@ def measure_k(volume: TetMesh, camera: Camera, *, order: AbstractOrder | None = 
     if not is_concrete(*jax.tree.leaves((volume, camera))):
         raise ValueError("measure_k cannot run inside jit or grad. Call it outside.")
     camera = jax.tree.map(lambda x: jnp.asarray(x).astype(volume.dtype), camera)
-    size = TILE[0] * TILE[1] * 4 // volume.dtype.itemsize
-    rays, count = batches(size, tuple(tile(x) for x in camera.rays()))
+    rays, count = batches(batch_size(volume.dtype), tuple(tile(x) for x in camera.rays()))
     source = _prepare(volume)
-    order, most, number = order or Centroid(), 8, rays[0].shape[0]
+    order, most, (number, size, _) = order or Centroid(), 8, rays[0].shape
     out, again = np.zeros((3, number, size), np.int32), np.arange(number)
     while len(again):
         # A power of two of batches, so that few functions are compiled.
@@ -115,24 +114,15 @@ def _measure(
     def one(inputs):
         origins, directions = inputs
         rays = beam_rays(origins, directions, source.scene.scale)
-        stream, sort = start_stream(source, size), Sort(order)
         integer = jnp.zeros(size, jnp.int32)
         far = jnp.full(size, jnp.inf, dtype)
         nothing = _Counts(jnp.full((most, size), -jnp.inf, dtype), (far, integer), integer, integer)
 
-        def going(loop):
-            return ~(over(loop[0]) & jnp.all(drawn(loop[0])))
-
-        def body(loop):
-            stream, counts = loop
-            stream = refill(stream, jnp.all(drawn(stream)), source, rays, sort)
-            stream, new = next_fragments(stream, source, rays.sheared, jnp.ones(size, bool))
+        def add(counts, new):
             # Depths are compared without what rounding may do to them.
-            eps = jnp.finfo(dtype).eps
-            slack = 16 * eps * (jnp.abs(new.at.z) + jnp.abs(rays.sheared.eye))
-            return stream, _count(counts, new.hit, new.at.z, slack)
+            return _count(counts, new.hit, new.at.z, tolerance(new.at.z, rays.sheared))
 
-        _, counts = lax.while_loop(going, body, (stream, nothing))
+        counts = draw(source, rays, Sort(order), nothing, add)
         first = counts.first[1]
         entries = jnp.maximum(jnp.maximum(counts.rest + 1, first), 1)
         return entries, jnp.maximum(counts.rest, first), counts.fragments

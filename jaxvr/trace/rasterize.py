@@ -22,21 +22,11 @@ from jaxvr._core.gather import take
 from jaxvr._core.pytree import pytree, static
 from jaxvr.order import AbstractOrder, Centroid
 from jaxvr.trace.face import crossing, opposite_edges, sizes_of
-from jaxvr.trace.scene import scale_of
+from jaxvr.trace.scene import coordinates_of, scale_of
 from jaxvr.trace.shear import shear_rays
-from jaxvr.trace.stream import (
-    BLOCK,
-    Sort,
-    beam_rays,
-    drawn,
-    face_at,
-    next_fragments,
-    over,
-    refill,
-    start_stream,
-)
+from jaxvr.trace.stream import BLOCK, Hits, Sort, beam_rays, draw, face_at
 from jaxvr.view.camera import Camera
-from jaxvr.view.tiles import TILE, batches, tile_order
+from jaxvr.view.tiles import batch_size, batches, tile_order
 
 Array = jax.Array
 
@@ -56,8 +46,8 @@ class Triangles:
         slot = (blocks[:, None] * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)[None]).reshape(-1)
         there, slot = slot < count, jnp.minimum(slot, count - 1)
         ids = self.corners(slot)
-        points = jnp.stack([take(self.vertices, 4 * ids + axis) for axis in range(3)])
-        return slot, (points[:, 0], points[:, 1], points[:, 2]), there
+        a, b, c = jnp.moveaxis(coordinates_of(self.vertices, ids), 1, 0)
+        return slot, (a, b, c), there
 
     def corners(self, slot: Array) -> Array:
         return take(self.ids, 3 * slot[None] + jnp.arange(3, dtype=jnp.int32)[:, None])
@@ -194,38 +184,21 @@ def triangle_source(points: Array, values: Array, triangles: Array) -> Triangles
     )
 
 
-def _walk(sort: Sort, source: Triangles, rays: Any, carry: Any, add: Any) -> Any:
-    """`add(carry, fragments)` for one fragment of each ray after the other."""
-    size = rays.origins.shape[1]
-
-    def body(loop):
-        stream, carry = loop
-        stream = refill(stream, jnp.all(drawn(stream)), source, rays, sort)
-        stream, new = next_fragments(stream, source, rays.sheared, jnp.ones(size, bool))
-        seen = new.hit & (new.at.z >= 0)
-        return stream, add(carry, new._replace(hit=seen))
-
-    def going(loop):
-        return ~(over(loop[0]) & jnp.all(drawn(loop[0])))
-
-    return lax.while_loop(going, body, (start_stream(source, size), carry))[1]
-
-
-def _size(source: Triangles) -> int:
-    """Rays of a batch."""
-    return TILE[0] * TILE[1] * 4 // source.vertices.dtype.itemsize
+def _ahead(new: Hits) -> Array:
+    """Fragments (R,) in front of the camera."""
+    return new.hit & (new.at.z >= 0)
 
 
 @partial(jax.jit, static_argnums=0)
 def _count(sort: Sort, source: Triangles, rays: Any) -> Array:
     """Fragments of each ray."""
-    rays, count = batches(_size(source), rays)
+    rays, count = batches(batch_size(source.vertices.dtype), rays)
 
     def one(inputs):
         origins, directions = inputs
         batch = beam_rays(origins, directions, source.scale)
         zero = jnp.zeros(batch.origins.shape[1], jnp.int32)
-        return _walk(sort, source, batch, zero, lambda n, new: n + new.hit.astype(jnp.int32))
+        return draw(source, batch, sort, zero, lambda n, new: n + _ahead(new).astype(jnp.int32))
 
     return lax.map(one, rays).reshape(-1)[:count]
 
@@ -233,7 +206,7 @@ def _count(sort: Sort, source: Triangles, rays: Any) -> Array:
 @partial(jax.jit, static_argnums=(0, 4))
 def _fill(sort: Sort, source: Triangles, rays: Any, start: Array, room: int) -> Any:
     """Slots, depths and scalars (room,), ray after ray from `start` (R,) on."""
-    (origins, directions, start), _ = batches(_size(source), (*rays, start))
+    (origins, directions, start), _ = batches(batch_size(source.vertices.dtype), (*rays, start))
 
     def one(arrays, inputs):
         origins, directions, first = inputs
@@ -241,15 +214,16 @@ def _fill(sort: Sort, source: Triangles, rays: Any, start: Array, room: int) -> 
 
         def add(carry, new):
             place, (faces, depths, scalars) = carry
-            at = jnp.where(new.hit, place, room)
+            seen = _ahead(new)
+            at = jnp.where(seen, place, room)
             arrays = (
                 faces.at[at].set(new.slot, mode="drop"),
                 depths.at[at].set(new.at.z * rays.sheared.stretch, mode="drop"),
                 scalars.at[at].set(new.at.value, mode="drop"),
             )
-            return place + new.hit.astype(jnp.int32), arrays
+            return place + seen.astype(jnp.int32), arrays
 
-        return _walk(sort, source, rays, (first, arrays), add)[1], None
+        return draw(source, rays, sort, (first, arrays), add)[1], None
 
     zero = jnp.zeros(room, source.vertices.dtype)
     nothing = (jnp.zeros(room, jnp.int32), zero, zero)

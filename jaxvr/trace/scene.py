@@ -141,6 +141,11 @@ def values_at(scene: Scene, cell: Array, corners: Array, wanted: Array) -> Array
     return load(wanted, find, scene.values, cell, corners, point)
 
 
+def coordinates_of(vertices: Array, ids: Array) -> Array:
+    """(3, ...) of points (...), as the scene has them; vertices (4 P,): see `Scene`."""
+    return jnp.stack([take(vertices, 4 * ids + axis) for axis in range(3)])
+
+
 def fetch(
     scene: Scene, rays: ShearedRays, cell: Array, corners: Array, wanted: Array
 ) -> tuple[Array, ...]:

@@ -35,9 +35,9 @@ from jaxvr._core.once import once
 from jaxvr._core.pytree import pytree
 from jaxvr._core.stage import stage
 from jaxvr.order import AbstractOrder, Faces
-from jaxvr.trace.beam import Beam, beam_of, may_meet, meets_boxes, outline, outside
+from jaxvr.trace.beam import Beam, Sides, beam_of, may_meet, meets_boxes, outline, outside, sides
 from jaxvr.trace.face import Crossing, Face, crossing, is_positive, opposite_edges, sizes_of
-from jaxvr.trace.scene import project
+from jaxvr.trace.scene import coordinates_of, project
 from jaxvr.trace.shear import ShearedRays, shear_rays
 
 Array = jax.Array
@@ -136,13 +136,12 @@ class Stream(NamedTuple):
     word: Array
 
 
-class Fragments(NamedTuple):
-    """One for each ray: hit (R,), whether it met a face; slot (R,) of that; face, positive (R,) and
+class Hits(NamedTuple):
+    """A fragment of each ray, or none: hit (R,), whether it met a face; slot (R,) of that; face and
     weights (3, R) as in `trace.raycast.Ahead`; at: depth and scalar."""
 
     hit: Array
     slot: Array
-    positive: Array
     face: Face
     weights: Array
     at: Crossing
@@ -190,7 +189,7 @@ def _select(sort: Sort) -> Any:
 
     def select(old: Selection, source: FaceSource, rays: BeamRays) -> Selection:
         size, beam = old.faces.shape[0], beam_of(rays.origins, rays.directions)
-        met = meets_boxes(beam, *source.boxes)
+        around, met = sides(beam), meets_boxes(beam, *source.boxes)
         blocks = met.shape[0]
         bounded = size < (blocks + LOOK) * BLOCK
         (numbers,) = jnp.nonzero(met, size=blocks + LOOK, fill_value=blocks)
@@ -204,7 +203,7 @@ def _select(sort: Sort) -> Any:
         def body(loop):
             index, faces, count, ceiling = loop
             at = lax.dynamic_slice(numbers, (index,), (LOOK,))
-            key, slot, valid = _look(source, beam, sort, at)
+            key, slot, valid = _look(source, beam, around, sort, at)
             valid = valid & _before(floor, (key, slot)) & _before((key, slot), ceiling)
             place, found = _places(valid)
             place = jnp.where(valid, count + place, size)
@@ -241,11 +240,11 @@ def _places(valid: Array) -> Place:
     return rank.reshape(-1), through[-1]
 
 
-def _look(source: FaceSource, beam: Beam, sort: Sort, blocks: Array) -> Any:
+def _look(source: FaceSource, beam: Beam, around: Sides, sort: Sort, blocks: Array) -> Any:
     """Keys, slots (N,) and which faces of some blocks the beam may meet."""
     slot, corners, valid = source.look(blocks)
     a, b, c = (corner - beam.origin[:, None] for corner in corners)
-    off = jnp.any(outside(beam, a) & outside(beam, b) & outside(beam, c), axis=0)
+    off = jnp.any(jnp.all(outside(around, jnp.stack([a, b, c], 1)), axis=1), axis=0)
     key = sort.order.keys(Faces(slot, (a, b, c), beam.axes[2], beam.pinhole))
     return _as_integers(key, sort.reverse), slot, valid & (~off | source.keep(beam.origin, slot))
 
@@ -322,8 +321,7 @@ def _cover_group(selection: Selection, source: FaceSource, beam: Beam, first, en
     live = number < end
     slot = selection.faces[jnp.minimum(number, selection.faces.shape[0] - 1), 1]
     ids = source.corners(jnp.where(live, slot, 0))
-    points = jnp.stack([take(source.vertices, 4 * ids + axis) for axis in range(3)])
-    points = points - beam.origin[:, None, None]
+    points = coordinates_of(source.vertices, ids) - beam.origin[:, None, None]
     face = outline(beam, (points[:, 0], points[:, 1], points[:, 2]), live)
     # Bit by bit: face 32 w + b is at (b, w).
     by_bit = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], 32, 32), -1, 0), face)
@@ -347,7 +345,7 @@ def _without_lowest(bits: Array) -> Array:
 
 def next_fragments(
     stream: Stream, source: FaceSource, rays: ShearedRays, go: Array
-) -> tuple[Stream, Fragments]:
+) -> tuple[Stream, Hits]:
     """The next face that each ray in `go` (R,) may meet, and whether it does."""
     go = go & ~drawn(stream)
     wanted, lane = jnp.any(go), jnp.arange(go.shape[0], dtype=jnp.int32)
@@ -373,18 +371,34 @@ def next_fragments(
 
     slot = load(wanted, find_slot, stream.selection.faces.reshape(-1), place)
     stream = stream._replace(groups=groups, words=words, bits=bits, group=group, word=word)
-    face, weights, inside, positive = meet(source, rays, slot, wanted)
-    at = stage(wanted, crossing, face, weights, rays.eye)
-    return stream, Fragments(go & inside, slot, positive, face, weights, at)
-
-
-def meet(source: FaceSource, rays: ShearedRays, slot: Array, wanted: Array) -> Any:
-    """The face (three times (4, R)) in each ray's slot (R,), its barycentric weights (3, R),
-    whether the ray's line meets it, and with which sign."""
     face = face_at(source, rays, slot, wanted)
     edges = stage(wanted, opposite_edges, *face)
     a, b, c = (is_positive(edge) for edge in edges)
-    return face, sizes_of(edges), (a == b) & (b == c), c
+    weights = sizes_of(edges)
+    at = stage(wanted, crossing, face, weights, rays.eye)
+    return stream, Hits(go & (a == b) & (b == c), slot, face, weights, at)
+
+
+def draw(source: FaceSource, rays: BeamRays, sort: Sort, carry: Any, add: Any) -> Any:
+    """`add(carry, hits)` for all fragments, one of each ray at a time; the last carry."""
+    size = rays.origins.shape[1]
+
+    def going(loop):
+        return ~(over(loop[0]) & jnp.all(drawn(loop[0])))
+
+    def body(loop):
+        stream, carry = loop
+        stream = refill(stream, jnp.all(drawn(stream)), source, rays, sort)
+        stream, new = next_fragments(stream, source, rays.sheared, jnp.ones(size, bool))
+        return stream, add(carry, new)
+
+    return lax.while_loop(going, body, (start_stream(source, size), carry))[1]
+
+
+def tolerance(depth: Array, rays: ShearedRays) -> Array:
+    """What rounding may do to a depth (R,) from the eye."""
+    eps = jnp.finfo(depth.dtype).eps
+    return 16 * eps * (jnp.abs(depth) + jnp.abs(lax.stop_gradient(rays.eye)))
 
 
 def face_at(source: FaceSource, rays: ShearedRays, slot: Array, wanted: Array) -> Face:

@@ -13,7 +13,15 @@ import numpy as np
 
 Array = jax.Array
 
-TILE = (16, 32)  # rows and columns of pixels
+# Rows and columns of pixels, and so the rays of a batch in float32: enough to hide the cost of
+# starting a kernel, few enough that they take about as many steps and their state stays in cache.
+TILE = (16, 32)
+
+
+def batch_size(dtype: Any) -> int:
+    """Rays of a batch. In float64 half as many: XLA hands larger kernels to several threads, at a
+    loss."""
+    return TILE[0] * TILE[1] * 4 // np.dtype(dtype).itemsize
 
 
 def batches(most: int, arrays: Any) -> tuple[Any, int]:
