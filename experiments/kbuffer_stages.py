@@ -2,9 +2,10 @@
 
     python -m experiments.kbuffer_stages bluntfin.vtu:density ... [--k 6] [--json F]
 
-Each stage is the difference of two timings of the same loops with more and more of them: faces of
-all tiles selected and sorted; bits of which rays may meet them; fragments taken; k-buffers fed; the
-whole render. Of the first, sorting alone is timed on lists of the same lengths. And the entry
+Stages are differences of timings of the same loops with more and more of them: faces of all tiles
+selected and sorted; bits of which rays may meet them; fragments taken; the whole render. Sorting
+alone is timed on lists of the same lengths, and integrating on cached segments, by JAX's loops too;
+feeding the k-buffers is what is left of the render. And the entry
 points of `RayCast`, found by its hierarchy and by the rasteriser over the boundary.
 """
 
@@ -74,20 +75,6 @@ def _fragments(scene: Any, rays: Any, sort: Any) -> Any:
     return streams.draw(scene, rays, sort, zero, add)
 
 
-def _walk(scene: Any, rays: Any, tracer: jaxvr.KBuffer) -> Any:
-    def going(loop):
-        return jnp.any(loop[0].active | loop[0].waiting)
-
-    def body(loop):
-        state, length, scalar = loop
-        state = tracer.step(scene, rays, state, state.active)
-        segment = state.segment
-        return state, length + segment.length, scalar + segment.front - segment.back
-
-    zero = jnp.zeros(SIZE, rays.origins.dtype)
-    return lax.while_loop(going, body, (tracer.start(scene, rays), zero, zero))[1:]
-
-
 def _entries(caster: jaxvr.RayCast, scene: Any, rays: Any) -> Any:
     last = (jnp.full(SIZE, -jnp.inf), jnp.full(SIZE, -1, jnp.int32))
     return search(scene.mesh, rays, scene.boxes, jnp.ones(SIZE, bool), last).depth
@@ -114,12 +101,13 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, k: int, repeat: int) -> lis
     values = jnp.zeros(volume.n_points, volume.dtype)
     surface = triangle_source(volume.points, values, jnp.asarray(boundary))
     draw_all = of_tiles(_fragments, sort)
+    segments = jaxvr.trace(volume, camera)
     tasks = {
         "select": lambda f=of_tiles(_select, sort): f(scene, rays),
         "sort": lambda: sort_all(scene, counts),
         "cover": lambda f=of_tiles(_cover, sort): f(scene, rays),
         "fragments": lambda: draw_all(scene, rays),
-        "walk": lambda f=of_tiles(_walk, tracer): f(scene, rays),
+        "shade": lambda: jaxvr.shade(segments, transfer, adjoint=jaxvr.Replay(native=False)),
         "render": lambda: jaxvr.render(volume, camera, transfer, tracer=tracer, status=True),
         "prepare": lambda f=jax.jit(tracer.prepare): f(volume),
         "entries by hierarchy": lambda: search_all(cast, cast_rays),
@@ -133,8 +121,8 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, k: int, repeat: int) -> lis
         "sort them": t["sort"],
         "cover": t["cover"] - t["select"],
         "take fragments": t["fragments"] - t["cover"],
-        "k-buffer": t["walk"] - t["fragments"],
-        "integrate and composite": t["render"] - t["walk"] - t["prepare"],
+        "k-buffer": t["render"] - t["prepare"] - t["fragments"] - t["shade"],
+        "integrate and composite": t["shade"],
     }
     rows = [
         {"mesh": name, "stage": stage, "seconds": seconds, "share": seconds / t["render"]}

@@ -143,9 +143,17 @@ class Outline(NamedTuple):
     c: Array
 
 
-def outline(beam: Beam, corners: tuple[Array, Array, Array], live: Array) -> Outline:
-    """Outlines of faces with corners (3, N) each, from the beam's origin. No ray may meet faces
-    that are not in `live` (N,)."""
+class Box(NamedTuple):
+    """Where the beam sees faces (N,): bounds (2, N) of x and y, with room for rounding; all of the
+    plane for a face without an image, and nothing for one that is not to be met."""
+
+    low: Array
+    high: Array
+
+
+def outline(beam: Beam, corners: tuple[Array, Array, Array], live: Array) -> tuple[Outline, Box]:
+    """Outlines of faces with corners (3, N) each, from the beam's origin, and boxes round them. No
+    ray may meet faces that are not in `live` (N,)."""
     eps = jnp.finfo(corners[0].dtype).eps
     x, y, blur, ahead = [], [], [], live & beam.narrow
     reach = 1 + jnp.max(jnp.abs(beam.place))
@@ -173,11 +181,23 @@ def outline(beam: Beam, corners: tuple[Array, Array, Array], live: Array) -> Out
     # Without an image all three are zero; where nothing is to be met, their signs differ.
     a, b, c = (jnp.where(ahead[None], row / slack, 0) for row in (a, b, c))
     never = jnp.array([2, -2, 0], c.dtype)[:, None]
-    return Outline(a, b, jnp.where(live[None], c, never))
+    far = jnp.where(live, jnp.inf, -jnp.inf).astype(c.dtype)[None]
+    bounds = jnp.stack([jnp.stack(x), jnp.stack(y)])
+    box = Box(
+        jnp.where(ahead[None], bounds.min(1) - 2 * d[None], -far),
+        jnp.where(ahead[None], bounds.max(1) + 2 * d[None], far),
+    )
+    return Outline(a, b, jnp.where(live[None], c, never)), box
+
+
+def overlaps(box: Box, low: Array, high: Array) -> Array:
+    """Whether boxes (2, N) overlap those with bounds (2, S): (S, N)."""
+    apart = (box.low[:, None] > high[..., None]) | (box.high[:, None] < low[..., None])
+    return ~(apart[0] | apart[1])
 
 
 def may_meet(face: Outline, place: Array) -> Array:
-    """Whether rays at place (2, 1, R) may meet faces (N, 1): (N, R)."""
+    """Whether rays at place (2, ..., 1, R) may meet faces (..., N, 1): (..., N, R)."""
     x, y = place
     e = [a * x + b * y + c for a, b, c in zip(face.a, face.b, face.c, strict=True)]
     left = jnp.minimum(jnp.minimum(e[0], e[1]), e[2]) >= -1

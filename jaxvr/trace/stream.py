@@ -7,8 +7,9 @@ batch of rays (a tile of the image, say) draws faces by itself, in three stages 
    through, and of the faces that the beam may meet those with the smallest keys are kept, at most
    `LIST`, sorted. If there are more, the next selection starts behind the last key: it is a window
    that moves over the sorted faces, without ever having them all.
-2. `cover`: a chunk of them at a time, which rays may meet which face, as one bit each. That is
-   dense, branch-free arithmetic: edge functions of `trace.beam`, all rays times all faces.
+2. `cover`: a chunk of them at a time, which rays may meet which face, as one bit each. Strips of
+   neighbouring rays have lists of the faces whose images overlap theirs; from there on it is dense,
+   branch-free arithmetic: edge functions of `trace.beam`, a strip's rays times all faces listed.
 3. `next_fragments`: each ray takes the next of its bits, gathers that face and decides exactly.
 
 The decision is that of the walk of `RayCast`, by exact signs that all faces share: an edge is
@@ -35,7 +36,18 @@ from jaxvr._core.once import once
 from jaxvr._core.pytree import pytree
 from jaxvr._core.stage import stage
 from jaxvr.order import AbstractOrder, Faces
-from jaxvr.trace.beam import Beam, Sides, beam_of, may_meet, meets_boxes, outline, outside, sides
+from jaxvr.trace.beam import (
+    Beam,
+    Outline,
+    Sides,
+    beam_of,
+    may_meet,
+    meets_boxes,
+    outline,
+    outside,
+    overlaps,
+    sides,
+)
 from jaxvr.trace.face import Crossing, Face, crossing, is_positive, opposite_edges, sizes_of
 from jaxvr.trace.scene import coordinates_of, project
 from jaxvr.trace.shear import ShearedRays, shear_rays
@@ -47,6 +59,7 @@ LOOK = 8  # blocks that are looked through at once
 LIST = 1 << 17  # faces that are selected at once, at most
 SAMPLE = 1 << 10  # of a full list, from which its quantiles are estimated
 GROUP = 1 << 10  # faces that are covered at once: 32 words of 32
+STRIP = 64  # neighbouring rays with a list of faces of their own
 BITS = 1 << 24  # of a chunk, for all rays together, unless that is less than a group's
 _INT = jnp.iinfo(jnp.int32)
 
@@ -119,8 +132,9 @@ class Selection(NamedTuple):
 class Stream(NamedTuple):
     """Where R rays stand in the stream of fragments.
 
-    chunk: first () and end (): its faces, by number in the selection. masks (G, 32, R) uint32: bit
-    b of word w of group g is set if the ray may meet the chunk's face number (32 g + w) 32 + b.
+    chunk: first () and end (): its faces, by number in the selection. slots (strips, 1024 G): of
+    each strip of rays, those whose images overlap its own, in order. masks (G, 32, R) uint32: bit b
+    of word w of group g is set if the ray may meet its strip's face number (32 g + w) 32 + b.
     marks (G, R) uint32: which words are not empty. Of each ray, as bits (R,) uint32: groups, the
     groups that it has not begun; words, of the group begun; bits, faces of the word begun. group,
     word (R,): which these are.
@@ -128,6 +142,7 @@ class Stream(NamedTuple):
 
     selection: Selection
     chunk: Place
+    slots: Array
     masks: Array
     marks: Array
     groups: Array
@@ -158,9 +173,10 @@ def start_stream(source: FaceSource, rays: int) -> Stream:
     # All groups of a chunk are bits of one word, too.
     groups = max(1, min(32, BITS // (GROUP * rays), size // GROUP))
     masks = jnp.zeros((groups, 32, rays), jnp.uint32)
+    slots = jnp.zeros((strips_of(rays), groups * GROUP), jnp.int32)
     integer = zero + jnp.zeros(rays, jnp.int32)
     return Stream(
-        *(selection, (zero, zero), masks, masks[:, 0]),
+        *(selection, (zero, zero), slots, masks, masks[:, 0]),
         *(unsigned, unsigned, unsigned, integer, integer),
     )
 
@@ -261,8 +277,8 @@ def _as_integers(key: Array, reverse: bool) -> Array:
 def _shrink(state: Any) -> Any:
     """About the nearer three quarters of a full list; the rest is left for the next selection.
 
-    The bound is that quantile of a sample: sorting the list takes twenty times as long. No two faces
-    are equal, so a quarter of the sample goes at least."""
+    The bound is that quantile of a sample: sorting the list takes twenty times as long. No two
+    faces are equal, so a quarter of the sample goes at least."""
     faces, count, _ = state
     size = faces.shape[0]
     sample = faces[: size - LOOK * BLOCK : max(1, size // SAMPLE)]
@@ -291,17 +307,22 @@ def _sorted_part(faces: Array, count: Array, size: int) -> Array:
     return lax.dynamic_update_slice(faces, jnp.stack(first, 1), (0, 0))
 
 
+def strips_of(rays: int) -> int:
+    """Number of strips that this many rays make."""
+    return rays // STRIP if rays % STRIP == 0 else 1
+
+
 def _cover(stream: Stream, source: FaceSource, rays: BeamRays) -> Stream:
     """The bits of the next chunk."""
     beam = beam_of(rays.origins, rays.directions)
     selection, (_, first) = stream.selection, stream.chunk
-    most = stream.masks.shape[0] * GROUP
-    end = jnp.minimum(first + most, selection.count)
-    groups = (end - first + GROUP - 1) // GROUP
+    end = jnp.minimum(first + stream.slots.shape[1], selection.count)
+    listed = _list_faces(stream, source, beam, first, end)
+    groups = (jnp.max(listed.count) + GROUP - 1) // GROUP
 
     def body(loop):
         group, masks, marks = loop
-        words = _cover_group(selection, source, beam, first + group * GROUP, end)
+        words = _cover_group(listed, beam, group * GROUP)
         masks = lax.dynamic_update_index_in_dim(masks, words, group, 0)
         return group + 1, masks, lax.dynamic_update_index_in_dim(marks, _marks(words), group, 0)
 
@@ -312,9 +333,55 @@ def _cover(stream: Stream, source: FaceSource, rays: BeamRays) -> Stream:
     used = jnp.concatenate([used, jnp.zeros((32 - used.shape[0], used.shape[1]), used.dtype)])
     zero = jnp.zeros_like(stream.bits)
     return Stream(
-        *(selection, (first, end), masks, marks, _marks(used), zero, zero),
+        *(selection, (first, end), listed.slots, masks, marks, _marks(used), zero, zero),
         *(stream.group, stream.word),
     )
+
+
+class _Listed(NamedTuple):
+    """faces (9, N): outlines of a chunk's faces. numbers (strips, N): of each strip, those that may
+    be met, as many as count (strips,); slots (strips, N): where they come from."""
+
+    faces: Array
+    numbers: Array
+    slots: Array
+    count: Array
+
+
+def _list_faces(stream: Stream, source: FaceSource, beam: Beam, first, end) -> _Listed:
+    """The faces of the selection from number `first` () to `end` (), for each strip."""
+    selection, (strips, size) = stream.selection, stream.slots.shape
+    place = beam.place.reshape(2, strips, -1)
+    low, high = place.min(2), place.max(2)
+    strip = jnp.arange(strips, dtype=jnp.int32)[:, None]
+    dtype = beam.place.dtype
+
+    def body(loop):
+        begin, out = loop
+        number = begin + jnp.arange(GROUP, dtype=jnp.int32)
+        live = first + number < end
+        row = jnp.minimum(first + number, selection.faces.shape[0] - 1)
+        slot = selection.faces[row, 1]
+        ids = source.corners(jnp.where(live, slot, 0))
+        points = coordinates_of(source.vertices, ids) - beam.origin[:, None, None]
+        face, box = outline(beam, (points[:, 0], points[:, 1], points[:, 2]), live)
+        valid = overlaps(box, low, high)
+        ranks, found = jax.vmap(_places)(valid)
+        to = strip * size + jnp.where(valid, out.count[:, None] + ranks, strips * size)
+        some = [jnp.broadcast_to(x[None], valid.shape) for x in (number, slot)]
+        numbers, slots = (
+            x.reshape(-1).at[to].set(y, mode="drop").reshape(x.shape)
+            for x, y in zip((out.numbers, out.slots), some, strict=True)
+        )
+        faces = lax.dynamic_update_slice(
+            out.faces, jnp.concatenate(face), (jnp.zeros_like(begin), begin)
+        )
+        return begin + GROUP, _Listed(faces, numbers, slots, out.count + found)
+
+    zeros = jnp.zeros((strips, size), jnp.int32)
+    none = _Listed(jnp.zeros((9, size), dtype), zeros, stream.slots, zeros[:, 0])
+    loop = (jnp.zeros((), jnp.int32), none)
+    return lax.while_loop(lambda x: first + x[0] < end, body, loop)[1]
 
 
 def _marks(words: Array) -> Array:
@@ -323,23 +390,29 @@ def _marks(words: Array) -> Array:
     return jnp.sum((words != 0).astype(jnp.uint32) << bit, axis=0, dtype=jnp.uint32)
 
 
-def _cover_group(selection: Selection, source: FaceSource, beam: Beam, first, end) -> Array:
-    """Words (32, R): which rays may meet which of the faces from number `first` () on."""
-    number = first + jnp.arange(GROUP, dtype=jnp.int32)
-    live = number < end
-    slot = selection.faces[jnp.minimum(number, selection.faces.shape[0] - 1), 1]
-    ids = source.corners(jnp.where(live, slot, 0))
-    points = coordinates_of(source.vertices, ids) - beam.origin[:, None, None]
-    face = outline(beam, (points[:, 0], points[:, 1], points[:, 2]), live)
-    # Bit by bit: face 32 w + b is at (b, w).
-    by_bit = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], 32, 32), -1, 0), face)
+def _cover_group(listed: _Listed, beam: Beam, begin: Array) -> Array:
+    """Words (32, R): which rays may meet which of the faces from number `begin` () of their list
+    on."""
+    strips, size = listed.numbers.shape
+    number = begin + jnp.arange(GROUP, dtype=jnp.int32)
+    row = lax.dynamic_slice_in_dim(listed.numbers, begin, GROUP, axis=1)
+    column = jnp.arange(9, dtype=jnp.int32)[:, None, None] * size
+    faces = take(listed.faces.reshape(-1), column + row[None])
+    # What is not in the list has constant edge functions of both signs.
+    used = number[None] < listed.count[:, None]
+    never = jnp.array([0, 0, 0, 0, 0, 0, 2, -2, 0], faces.dtype)
+    faces = jnp.where(used[None], faces, never[:, None, None])
+    # Bit by bit: face 32 w + b is at (b, strip, w).
+    by_bit = jnp.moveaxis(faces.reshape(3, 3, strips, 32, 32), -1, 0)[..., None]
+    place = beam.place.reshape(2, strips, 1, -1)
 
     def body(bit, words):
-        one = jax.tree.map(lambda x: x[bit][..., None], by_bit)
-        meets = may_meet(one, beam.place[:, None])
+        meets = may_meet(Outline(*by_bit[bit]), place)
         return words | (meets.astype(jnp.uint32) << bit.astype(jnp.uint32))
 
-    return lax.fori_loop(0, 32, body, jnp.zeros((32, beam.place.shape[1]), jnp.uint32))
+    words = jnp.zeros((strips, 32, place.shape[-1]), jnp.uint32)
+    words = lax.fori_loop(0, 32, body, words)
+    return jnp.moveaxis(words, 0, 1).reshape(32, -1)
 
 
 def _lowest(bits: Array) -> Array:
@@ -374,10 +447,9 @@ def next_fragments(
     place = jnp.where(go, (32 * group + word) * 32 + _lowest(bits), 0)
     bits = jnp.where(go, _without_lowest(bits), bits)
 
-    def find_slot(faces, place):
-        return take(faces, 2 * (stream.chunk[0] + place) + 1)
-
-    slot = load(wanted, find_slot, stream.selection.faces.reshape(-1), place)
+    strips, size = stream.slots.shape
+    strip = lane // (go.shape[0] // strips)
+    slot = load(wanted, take, stream.slots.reshape(-1), strip * size + place)
     stream = stream._replace(groups=groups, words=words, bits=bits, group=group, word=word)
     face = face_at(source, rays, slot, wanted)
     edges = stage(wanted, opposite_edges, *face)
