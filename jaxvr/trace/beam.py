@@ -154,38 +154,35 @@ class Box(NamedTuple):
 def outline(beam: Beam, corners: tuple[Array, Array, Array], live: Array) -> tuple[Outline, Box]:
     """Outlines of faces with corners (3, N) each, from the beam's origin, and boxes round them. No
     ray may meet faces that are not in `live` (N,)."""
-    eps = jnp.finfo(corners[0].dtype).eps
-    x, y, blur, ahead = [], [], [], live & beam.narrow
+    # Barriers keep XLA from computing all of this again for each of the twelve numbers.
+    held = lax.optimization_barrier
+    eps = jnp.finfo(corners.dtype).eps
+    right, up, depth = held(_apply(beam.axes, corners))
     reach = 1 + jnp.max(jnp.abs(beam.place))
-    for corner in corners:
-        right, up, depth = _apply(beam.axes, corner)
-        size = jnp.sum(jnp.abs(corner), axis=0)
-        w = jnp.where(beam.pinhole, depth, 1)
-        near = w > 1e-3 * size  # or its image is too far off to be of use
-        ahead = ahead & (near | ~beam.pinhole)
-        w = jnp.where(near, w, 1)
-        x.append(right / w)
-        y.append(up / w)
-        wide = reach + jnp.abs(right / w) + jnp.abs(up / w)
-        blur.append(ROUNDINGS * eps * (size / w + 1) * wide)
-    d = jnp.maximum(jnp.maximum(blur[0], blur[1]), blur[2])
-    rows = []
-    for i, j in ((1, 2), (2, 0), (0, 1)):
-        to_x, to_y = x[j] - x[i], y[j] - y[i]
-        length = jnp.abs(to_x) + jnp.abs(to_y)
-        slack = 4 * d * (length + d) + 4 * eps * (jnp.abs(to_x * y[i]) + jnp.abs(to_y * x[i]))
-        rows.append((-to_y, to_x, to_y * x[i] - to_x * y[i], slack))
-    a, b, c, slack = (jnp.stack(r) for r in zip(*rows, strict=True))
-    size = jnp.stack(x).max(0) - jnp.stack(x).min(0) + jnp.stack(y).max(0) - jnp.stack(y).min(0)
-    slack = slack + 4 * d[None] * size[None]
+    size = jnp.sum(jnp.abs(corners), axis=0)
+    w = jnp.where(beam.pinhole, depth, 1)
+    near = w > 1e-3 * size  # or its image is too far off to be of use
+    ahead = live & beam.narrow & (jnp.all(near, axis=0) | ~beam.pinhole)
+    w = jnp.where(near, w, 1)
+    x, y = right / w, up / w
+    blur = ROUNDINGS * eps * (size / w + 1) * (reach + jnp.abs(x) + jnp.abs(y))
+    x, y, d, ahead = held((x, y, jnp.max(blur, axis=0), ahead))
+    low_x, high_x, low_y, high_y = x.min(0), x.max(0), y.min(0), y.max(0)
+    # Edges opposite each of the corners.
+    x_i, x_j, y_i, y_j = (jnp.roll(v, shift, axis=0) for v in (x, y) for shift in (-1, -2))
+    to_x, to_y = x_j - x_i, y_j - y_i
+    length = jnp.abs(to_x) + jnp.abs(to_y)
+    slack = 4 * d[None] * (length + d[None])
+    slack = slack + 4 * eps * (jnp.abs(to_x * y_i) + jnp.abs(to_y * x_i))
+    slack = slack + 4 * (d * (high_x - low_x + high_y - low_y))[None]
     # Without an image all three are zero; where nothing is to be met, their signs differ.
-    a, b, c = (jnp.where(ahead[None], row / slack, 0) for row in (a, b, c))
+    scale = held(jnp.where(ahead[None], 1 / slack, 0))
+    a, b, c = -to_y * scale, to_x * scale, (to_y * x_i - to_x * y_i) * scale
     never = jnp.array([2, -2, 0], c.dtype)[:, None]
     far = jnp.where(live, jnp.inf, -jnp.inf).astype(c.dtype)[None]
-    bounds = jnp.stack([jnp.stack(x), jnp.stack(y)])
     box = Box(
-        jnp.where(ahead[None], bounds.min(1) - 2 * d[None], -far),
-        jnp.where(ahead[None], bounds.max(1) + 2 * d[None], far),
+        jnp.where(ahead[None], jnp.stack([low_x, low_y]) - 2 * d[None], -far),
+        jnp.where(ahead[None], jnp.stack([high_x, high_y]) + 2 * d[None], far),
     )
     return Outline(a, b, jnp.where(live[None], c, never)), box
 
