@@ -58,13 +58,13 @@ def dtype(request):
 
 @pytest.fixture(scope="module")
 def quick_code():
-    """`render`, `render_rays`, `trace` and `shade` outside of `jit` compile in a third of the time:
-    see `quick`. For modules that do not test rounding."""
+    """`render`, `render_rays`, `trace`, `shade`, `probe` and `measure_k` outside of `jit` compile
+    in a third of the time: see `quick`. For modules that do not test rounding."""
     import quick
 
     with pytest.MonkeyPatch.context() as patch:
-        for name, verb in quick.verbs().items():
-            patch.setattr(quick.RENDER, name, verb)
+        for verb in quick.verbs():
+            patch.setattr(verb.module, verb.name, verb)
         yield
 
 

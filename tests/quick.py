@@ -20,23 +20,29 @@ jit = functools.partial(jax.jit, compiler_options=EMITTERS | {"xla_backend_optim
 # With LLVM's optimiser, which fuses products and sums: where those may be rounded once or twice.
 rounded_jit = functools.partial(jax.jit, compiler_options=EMITTERS)
 
-RENDER: Any = importlib.import_module("jaxvr.render")  # `jaxvr.render` is the function
+# Functions of modules and their static arguments. (`jaxvr.render` and `jaxvr.probe` are functions.)
 STATIC = {
-    "_render": (0, 1, 2),
-    "_render_rays": (0, 1, 2),
-    "_shade": (0, 1, 2),
-    "_count": (0, 1, 2),
-    "_fill": (0, 1, 2, 7),
+    "jaxvr.render": {
+        "_render": (0, 1, 2),
+        "_render_rays": (0, 1, 2),
+        "_shade": (0, 1, 2),
+        "_count": (0, 1, 2),
+        "_fill": (0, 1, 2, 7),
+    },
+    "jaxvr.probe": {"_prepare": (0,), "_count": (0,), "_walk": (0, 1)},
+    "jaxvr.trace.measure": {"_measure": (0, 1)},
 }
 
 
 class Verb:
-    """A compiled function of `jaxvr.render` in quick code; what is traced is left to the caller's
-    own `jit` or `grad`, since options are those of the outermost."""
+    """A compiled function of a module in quick code; what is traced is left to the caller's own
+    `jit` or `grad`, since options are those of the outermost."""
 
-    def __init__(self, name: str):
-        self.own: Any = getattr(RENDER, name)
-        self.quick: Any = jit(self.own.__wrapped__, static_argnums=STATIC[name])
+    def __init__(self, module: str, name: str):
+        self.module: Any = importlib.import_module(module)
+        self.name = name
+        self.own: Any = getattr(self.module, name)
+        self.quick: Any = jit(self.own.__wrapped__, static_argnums=STATIC[module][name])
 
     def __call__(self, *args):
         concrete = is_concrete(*jax.tree.leaves(args))
@@ -47,6 +53,6 @@ class Verb:
 
 
 @functools.cache
-def verbs() -> dict[str, Verb]:
+def verbs() -> list[Verb]:
     """Made once, so that all modules share what is compiled."""
-    return {name: Verb(name) for name in STATIC}
+    return [Verb(module, name) for module, names in STATIC.items() for name in names]

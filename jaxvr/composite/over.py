@@ -106,6 +106,7 @@ class Over:
         return self.direction == "back to front"
 
     def start(self, rays: int, dtype: Any) -> OverState:
+        """The state of R `rays` before their first piece."""
         zero, zeros = jnp.zeros(rays, dtype), jnp.zeros((3, rays), dtype)
         return OverState((zero, zero), (zeros, zeros))
 

@@ -28,7 +28,8 @@ from jaxvr.trace.recorded import Recorded
 
 
 def missing(dtype: Any = "float32") -> str | None:
-    """None where compiled loops are available on this machine, else why not. Compiles them."""
+    """None where compiled loops for a dtype, float32 or float64, are available on this machine,
+    else why not. Compiles them."""
     if jax.default_backend() != "cpu":
         return f"JAX computes on {jax.default_backend()}, and these loops are for CPUs."
     name = np.dtype(dtype).name
@@ -40,7 +41,8 @@ def missing(dtype: Any = "float32") -> str | None:
 def covers(wanted: bool | None, dtype: Any, *nouns: Any) -> bool:
     """Whether compiled loops are to be used for these tracers, integrators and compositors.
 
-    wanted: None where they can be, False never, True always.
+    wanted: None where they can be, False never, True always. dtype: of the volume. nouns: those of
+    the call.
 
     Raises:
       ValueError: if they are wanted and cannot be used, with the reason.

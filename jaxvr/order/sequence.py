@@ -71,8 +71,9 @@ def displacement(values: Any, positions: Any = None) -> Any:
 
 
 def is_k_nearly_sorted(values: Any, k: int, positions: Any = None) -> Any:
-    """Whether (...) no value is more than k positions out of order. In the paper k is the largest
-    displacement itself; here any k above it serves too."""
+    """Whether (...) none of the values (..., N) is more than k positions out of order, `positions`
+    as for `displacement`. In the paper k is the largest displacement itself; here any k above it
+    serves too."""
     return displacement(values, positions) <= k
 
 

@@ -81,6 +81,15 @@ class AbstractTracer(abc.ABC):
         """
 
     @abc.abstractmethod
+    def locate(self, scene: Any, rays: Any, state: Any) -> tuple[Array, Array]:
+        """Of the current segments: the cell (R,) int32 that each lies in, and the distance (R,)
+        from the ray's origin to its back. Of rays without a segment: anything.
+
+        Raises:
+          ValueError: if the tracer does not know.
+        """
+
+    @abc.abstractmethod
     def gradient_start(self, scene: Any, rays: Any, perturbed: tuple[Any, Any]) -> tuple[Any, Any]:
         """Zeros to accumulate in, for the scene and for a batch of rays. `perturbed` has the
         structure of (scene, rays), with True at leaves whose gradients are asked for."""

@@ -46,6 +46,7 @@ from jaxvr.trace.faces import CellFaces, cell_faces
 from jaxvr.trace.local import (
     as_rays,
     as_scene,
+    crossing_of_face,
     gradient_zeros,
     pull_back_pair,
     segment_between,
@@ -183,6 +184,11 @@ class KBuffer(AbstractTracer):
             state = state._replace(stream=stream)
             entry = _entry(scene.scene, rays, new, self)
             return _give(rays, _arrive(rays, state, new.hit, entry, self), go, done, self)
+
+    def locate(self, scene: CellFaces, rays: BeamRays, state: BufferState) -> tuple[Array, Array]:
+        near, far = (jnp.where(state.active, word, 0) for word in state.ends)
+        at = crossing_of_face(scene.scene, rays.sheared, far, jnp.any(state.active))
+        return packing.cell_of(near), (at.z + at.z_low) * rays.sheared.stretch
 
     def gradient_start(self, scene, rays, perturbed):
         by_rays = any(jax.tree.leaves(perturbed[1]))

@@ -327,6 +327,11 @@ class _End(NamedTuple):
     at: Crossing
 
 
+def crossing_of_face(scene: Scene, rays: ShearedRays, word: Array, wanted: Array) -> Crossing:
+    """Where rays cross faces, given by packed cell and corner (R,)."""
+    return _end(scene, rays, word, wanted).at
+
+
 def _end(scene: Scene, rays: ShearedRays, word: Array, wanted: Array) -> _End:
     cell = packing.cell_of(word)
     corners = entry_corners(packing.corner_of(word))

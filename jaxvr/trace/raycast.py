@@ -107,8 +107,8 @@ class Ahead(NamedTuple):
 
 
 class CastState(NamedTuple):
-    """One state of R rays. Only `pull_back` reads `cell`: loops without it do not carry it, since
-    XLA drops what nothing depends on."""
+    """One state of R rays. Only `pull_back` and `locate` read `cell`: loops without them do not
+    carry it, since XLA drops what nothing depends on."""
 
     cell: Cell
     ahead: Ahead
@@ -183,6 +183,10 @@ class RayCast(AbstractTracer):
                 ahead=ahead, active=active, waiting=waiting, entries=entries, last=last
             )
             return _cross(scene.mesh, rays, state, moved, enter)
+
+    def locate(self, scene: CastScene, rays: ShearedRays, state: CastState) -> tuple[Array, Array]:
+        depth = state.ahead.depth[0] + state.ahead.depth[1]
+        return packing.cell_of(state.cell.word), depth * rays.stretch
 
     def gradient_start(self, scene, rays, perturbed):
         by_rays = any(jax.tree.leaves(perturbed[1]))

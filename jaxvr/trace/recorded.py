@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxvr._core.brief import dtype_of, is_known
 from jaxvr._core.pytree import pytree, static
 from jaxvr.optics.partition import Segment, turned
 from jaxvr.trace.base import AbstractTracer
@@ -52,6 +53,12 @@ class Segments:
         """Bytes on the device."""
         arrays = (self.scalar, self.length, self.start, self.status, self.order)
         return sum(a.size * a.dtype.itemsize for a in arrays)
+
+    def __repr__(self) -> str:
+        # leaves may be tracers or placeholders
+        nodes = f"{self.count:,}" if is_known(self.start) and self.start.size else "?"
+        shape = " x ".join(map(str, self.shape)) or "1"
+        return f"Segments({shape} rays, {nodes} nodes, {dtype_of(self.scalar)})"
 
 
 class Nodes(NamedTuple):
@@ -124,6 +131,12 @@ class Recorded(AbstractTracer):
         segment = segment._replace(front=jnp.where(jump, segment.back, segment.front))
         return PlayState(
             node, segment, active, jnp.zeros_like(first), (first | jump) & active, state.status
+        )
+
+    def locate(self, scene, rays, state):
+        raise ValueError(
+            "Recorded segments know scalars and lengths, but not which cells they came from. "
+            "Probe the volume itself."
         )
 
     def gradient_start(self, scene, rays, perturbed):

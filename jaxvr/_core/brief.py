@@ -1,0 +1,44 @@
+"""Arrays in a few characters, for reprs, which must not fail whatever stands in a tree's leaves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxvr._core.checks import is_concrete
+
+
+def is_known(*leaves: Any) -> bool:
+    """True if all leaves are arrays of real numbers that can be looked at: no tracers, placeholders
+    or deleted buffers."""
+    return all(
+        isinstance(x, jax.Array | np.ndarray)
+        and is_concrete(x)
+        and getattr(x.dtype, "kind", "?") in "fiu"
+        and not (isinstance(x, jax.Array) and x.is_deleted())
+        for x in leaves
+    )
+
+
+def brief(x: Any) -> str:
+    """A number or a short vector by its numbers, any other array by dtype and shape, else "?"."""
+    if is_known(x) and x.ndim < 2 and x.size <= 4:
+        numbers = ", ".join(f"{float(v):.6g}" for v in np.asarray(x).reshape(-1))
+        return numbers if x.ndim == 0 else f"({numbers})"
+    dtype, shape = getattr(x, "dtype", None), getattr(x, "shape", None)
+    if dtype is None or not isinstance(shape, tuple):
+        return "?"
+    return f"{dtype}[{', '.join(map(str, shape))}]"
+
+
+def length_of(x: Any) -> str:
+    """Entries along the first axis as text, "?" where there is none."""
+    shape = getattr(x, "shape", None)
+    return f"{shape[0]:,}" if isinstance(shape, tuple) and shape else "?"
+
+
+def dtype_of(x: Any) -> str:
+    """Name of the dtype, "?" where there is none."""
+    return str(getattr(x, "dtype", "?"))
