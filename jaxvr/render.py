@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxvr import hints
 from jaxvr import native as compiled
 from jaxvr._core.checks import as_floats, is_concrete, require_finite
 from jaxvr._core.status import check
@@ -78,6 +79,9 @@ def render(
         back to front with a tracer that cannot. RenderError: if a ray could not be followed. Of
         values only where they are concrete, not inside your own `jit`.
 
+    Warns, also only there, with a `jaxvr.ViewWarning` that says what a blank picture comes from, or
+    that the field's range and the transfer function's do not fit, or that the eye is in the volume.
+
     Differentiable in `volume.values`, `volume.points`, `transfer` (positions, colors, extinctions),
     `camera` (eye, target, up, fov or extent) and `background`. Notes on kinks are with `RayCast`,
     `jaxvr.optics.partition` and the adjoints.
@@ -85,7 +89,7 @@ def render(
     pipeline = _pipeline(tracer or RayCast(), integrator, compositor)
     camera = _camera_of(camera, _volume_of(volume))
     transfer = _transfer_of(transfer, volume)
-    image, bits = _render(
+    image, bits, seen = _render(
         *(pipeline, adjoint or Replay(), _batch_size(budget, volume), volume, camera, transfer),
         _background(background),
     )
@@ -93,6 +97,7 @@ def render(
         return image, bits
     if is_concrete(bits):
         check(bits)
+        hints.look(volume, camera, transfer, seen, stacklevel=2)
     return image
 
 
@@ -239,8 +244,9 @@ def _render(pipeline, adjoint, size, volume, camera, transfer, background):
     height, width = camera.height, camera.width
     origins, directions = (tile(x) for x in camera.rays())
     rgba, status = _run(pipeline, adjoint, size, volume, origins, directions, transfer)
+    seen = lax.stop_gradient(rgba[:, 3]).max()  # for `hints`; a background hides it
     rgba = _over(untile(rgba, height, width), background)
-    return rgba, untile(status[:, None], height, width)[..., 0]
+    return rgba, untile(status[:, None], height, width)[..., 0], seen
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))

@@ -25,14 +25,22 @@ from .weld import weld
 # comparators of a sorting network for four keys
 _NETWORK = ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2))
 
+# A cell is twisted if more than this part of its volume lies the other way round than the rest.
+# Thin curved cells have slivers that do; wrong orders of the nodes turn a quarter or more.
+_TWISTED = 0.05
+# Cells on which other orders are tried.
+_SAMPLE = 1000
+
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """Input cells of one type. corners (N, n): point ids in VTK's order."""
+    """Input cells of one type. corners (N, n): point ids in VTK's order; columns: where each of
+    them stood in the cells as given."""
 
     name: str
     kind: zoo.CellKind
     corners: np.ndarray
+    columns: tuple[int, ...]
 
 
 def mesh_dtype(points: Any, dtype: Any) -> np.dtype:
@@ -128,7 +136,7 @@ def read_blocks(cells: Any, n_points: int) -> tuple[list[Block], dict[str, int],
         ids = read_indices(label, x, nodes, kind.n_corners, n_points)
         if ids.shape[1] > kind.n_corners and len(ids):
             reduced[label] = len(ids)
-        blocks.append(Block(label, kind, ids[:, corners]))
+        blocks.append(Block(label, kind, ids[:, corners], corners))
     if sum(len(b.corners) for b in blocks) == 0:
         found = ", ".join(f"{n} {t}" for t, n in ignored.items()) or "none at all"
         raise ValueError(f"The mesh has no solid cells (found: {found}).")
@@ -174,6 +182,59 @@ def _input_name(i: int, blocks: list[Block]) -> str:
     raise AssertionError
 
 
+def _cut(
+    pts: np.ndarray, welded: np.ndarray, kind: zoo.CellKind, corners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Cells as tetrahedra (T, 4), their parents (T,), volumes times six (T,) and signs (T,), which
+    are 0 for those without volume and those that repeat a point."""
+    t, p = zoo.subdivide(kind, corners, welded)
+    ids = welded[t]
+    volume, s = signed_volumes(pts, t)
+    for i in range(4):
+        for j in range(i):
+            s[ids[:, i] == ids[:, j]] = 0
+    return t, p, volume, s
+
+
+def _twisted(
+    parent: np.ndarray, volume: np.ndarray, sign: np.ndarray, n: int
+) -> tuple[int, int, int]:
+    """Of n cells, how many are twisted (see `_TWISTED`), and how many of the others are positive
+    and negative. Flat ones are none of the three."""
+    up = np.bincount(parent, np.where(sign > 0, volume, 0), n)
+    down = np.bincount(parent, np.where(sign < 0, -volume, 0), n)
+    mixed = np.minimum(up, down) > _TWISTED * (up + down)
+    return int(mixed.sum()), int((up > down)[~mixed].sum()), int((down > up)[~mixed].sum())
+
+
+def _require_order(
+    pts: np.ndarray, welded: np.ndarray, block: Block, counts: tuple[int, int, int]
+) -> None:
+    """ValueError if most cells of a block are twisted, with the order of their nodes if it is a
+    known one. counts: from `_twisted`."""
+    twisted, solid = counts[0], sum(counts)
+    if 2 * twisted <= solid:
+        return
+    sample = block.corners[:: -(-len(block.corners) // _SAMPLE)]
+    untwisting = {}
+    for columns in zoo.ORDERS[block.kind.name]:
+        _, p, volume, s = _cut(pts, welded, block.kind, sample[:, columns])
+        still, positive, _ = _twisted(p, volume, s, len(sample))
+        if still <= len(sample) // 100:  # real meshes have some that nothing untwists
+            untwisting[columns] = positive
+    advice = ""
+    if untwisting:
+        # A reflection of the right order untwists too, and turns the cells inside out.
+        columns = max(untwisting, key=lambda c: untwisting[c])
+        use = [block.columns[i] for i in columns]
+        advice = f' They are consistent as {{"{block.kind.name}": cells[:, {use}]}}.'
+    raise ValueError(
+        f"{twisted} of {solid} {block.name} cells are twisted: their tetrahedra lie some one way "
+        "round and some the other. Their nodes are probably not in VTK's order, which is "
+        f"{zoo.ORDER_WORDS[block.kind.name]}.{advice}"
+    )
+
+
 def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Built:
     """Everything but the values. Raises ValueError as `TetMesh.from_cells` says."""
     pts = read_points(points, dtype)
@@ -182,12 +243,9 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
 
     tets, parent, sign, start = [], [], [], 0
     for b in blocks:
-        t, p = zoo.subdivide(b.kind, b.corners, welded)
-        ids = welded[t]
-        _, s = signed_volumes(pts, t)
-        for i in range(4):
-            for j in range(i):
-                s[ids[:, i] == ids[:, j]] = 0
+        t, p, volume, s = _cut(pts, welded, b.kind, b.corners)
+        if b.kind is not zoo.TETRA:
+            _require_order(pts, welded, b, _twisted(p, volume, s, len(b.corners)))
         # two node orders are in use for wedges (see cells.WEDGE); the sign of most tells which
         if b.kind is zoo.WEDGE and int(s.sum(dtype=np.int64)) < 0:
             s = -s

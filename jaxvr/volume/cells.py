@@ -68,6 +68,26 @@ PYRAMID = CellKind(
 )
 KINDS = {k.name: k for k in (TETRA, HEXAHEDRON, WEDGE, PYRAMID)}
 
+# Orders that other programs write, as the columns that make VTK's of them. Counted with x fastest
+# (deal.II, DOLFINx, VTK's voxel) and with z fastest (NumPy's ravel), the two faces by turns, and
+# the second face the other way round.
+ORDERS = {
+    "hexahedron": (
+        (0, 1, 3, 2, 4, 5, 7, 6),
+        (0, 4, 6, 2, 1, 5, 7, 3),
+        (0, 2, 4, 6, 1, 3, 5, 7),
+        (0, 1, 2, 3, 4, 7, 6, 5),
+    ),
+    "wedge": ((0, 2, 4, 1, 3, 5), (0, 1, 2, 3, 5, 4)),
+    "pyramid": ((0, 1, 3, 2, 4),),
+}
+ORDER_WORDS = {
+    "hexahedron": "one face counter-clockwise as seen from the opposite one, then that one in the "
+    "same order",
+    "wedge": "one triangle, then the opposite one in the same order",
+    "pyramid": "the base counter-clockwise as seen from the apex, then the apex",
+}
+
 _ALIASES = {
     "tet": "tetra", "tetrahedron": "tetra", "hex": "hexahedron", "hexa": "hexahedron",
     "prism": "wedge", "penta": "wedge", "pyra": "pyramid",

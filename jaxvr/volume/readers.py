@@ -9,6 +9,7 @@ to be asked for by component.
 from __future__ import annotations
 
 import contextlib
+import difflib
 import io
 import mmap
 import os
@@ -112,6 +113,16 @@ def _listing(fields: list[Field]) -> str:
     return "It has " + ", ".join(words)
 
 
+def _near(name: str, fields: list[Field]) -> str:
+    """A question that names the field most like this one, if there is any like it."""
+    names = {f.name.lower(): f.name for f in fields}
+    base, dot, part = name.rpartition(".")
+    for word, rest in ((name, ""), (base, dot + part)):
+        if near := difflib.get_close_matches(word.lower(), names, n=1):
+            return f'Did you mean "{names[near[0]]}{rest}"? '
+    return ""
+
+
 def _active(path: Path) -> str | None:
     """The active point scalars that a VTU file names (meshio does not tell)."""
     if path.suffix.lower() != ".vtu":
@@ -149,7 +160,8 @@ def _choose(
     base, _, part = str(name).rpartition(".")
     vector = next((f for f in wanted if f.name == base), None)
     if vector is None:
-        raise ValueError(f"{path.name} has no{where} field {name!r}. {_listing(fields)}.")
+        near = _near(str(name), wanted)
+        raise ValueError(f"{path.name} has no{where} field {name!r}. {near}{_listing(fields)}.")
     index = AXES.get(part, int(part) if part.isdecimal() else -1)
     if part != "magnitude" and not 0 <= index < vector.components:
         raise ValueError(
@@ -168,7 +180,7 @@ def _scalar(data: Any, part: int | str | None) -> np.ndarray:
 
 
 def list_fields(path: Any) -> list[Field]:
-    """The fields of a mesh file, point data first. Errors are those of `read_mesh`."""
+    """The fields of the mesh file at `path`, point data first. Errors are those of `read_mesh`."""
     file = _path(path)
     mesh = _load(file)
     try:
@@ -182,6 +194,7 @@ def read_mesh(
 ) -> TetMesh:
     """The mesh in a file, with one of its fields. Reads whatever meshio reads.
 
+    path: a file whose name ends as its format wants it.
     field: the name of a point or cell field; "name.x", "name.y", "name.z", "name.0" or
         "name.magnitude" for one that has components. `None` takes the active scalar point field if
         the file names one, else the first scalar, point fields before cell fields.
@@ -230,7 +243,8 @@ def _suffix(part: int | str) -> str:
 
 
 def write_mesh(path: Any, mesh: TetMesh) -> None:
-    """Write the tetrahedra (positively oriented) and the field, in the format of the file's name.
+    """Write the tetrahedra (positively oriented) of a mesh and its field to the file at `path`, in
+    the format of its name.
 
     Point and cell data are written as such. Files have no data per corner: those become point data
     on points of each tetrahedron's own, which `read_mesh` welds again, so the mesh that comes back

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .._core.checks import is_concrete
 from .build import Built, floats
 
 LOCATIONS = ("point", "cell", "corner")
@@ -87,6 +88,33 @@ def place(values: Any, built: Built, location: str | None) -> tuple[np.ndarray, 
     if where == "corner":
         values = np.take_along_axis(values, built.order.astype(np.intp), 1)
     return values, where
+
+
+def rounded(name: str, values: Any, dtype: np.dtype) -> str | None:
+    """That float32 cannot hold some of these integers (ids, labels, counts), or None."""
+    if isinstance(values, Mapping):
+        found = (rounded(f"{name}[{k!r}]", v, dtype) for k, v in values.items())
+        return next((message for message in found if message), None)
+    if dtype != np.float32 or not is_concrete(values):
+        return None
+    if np.dtype(getattr(values, "dtype", int)).kind not in "iu":
+        return None
+    try:
+        given = np.asarray(values)
+    except ValueError:
+        return None  # an entry for points, lines or faces, which nobody reads
+    if given.dtype.kind not in "iu" or given.size == 0:
+        return None
+    wide = given.astype(np.float64)
+    lost = wide != wide.astype(np.float32)
+    if not lost.any():
+        return None
+    first = int(given[lost][0])
+    return (
+        f"{name} has {int(lost.sum())} integers that float32 cannot hold, the first is {first}, "
+        f"which becomes {int(np.float32(first))}: above 2**24 = {2**24} whole numbers are rounded. "
+        'Subtract an offset, or turn on jax_enable_x64 and pass dtype="float64".'
+    )
 
 
 def _join(values: Mapping[Any, Any], built: Built, dtype: np.dtype) -> np.ndarray:

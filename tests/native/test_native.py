@@ -71,6 +71,7 @@ def test_rays_of_all_directions_in_one_packet(dtype):
 
 
 @pytest.mark.parametrize("extinction", [1e-6, 1.0, 30.0, 1e4])
+@pytest.mark.filterwarnings("ignore::jaxvr.hints.ViewWarning")
 def test_thin_and_opaque_cells(extinction, dtype):
     """On both sides of where the rule of few nodes ends."""
     mesh, camera = registry.mesh_of("point", dtype), registry.camera_of(dtype)

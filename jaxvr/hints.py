@@ -1,0 +1,285 @@
+"""What a strange picture may come from, as warnings that `jaxvr.render` gives.
+
+A picture that is empty or of one colour is no error, and it does not say which number is wrong: the
+camera may look away, the field may be in other units than the transfer function, or opacities may
+stand where extinctions per unit of length belong. After a render outside `jit` and `grad` one small
+reduction looks at the largest alpha, the ends of the field and of the transfer function, and
+where the eye stands. Only where one of them is odd is the reason looked for, in NumPy.
+"""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._core.checks import is_concrete
+from .optics import TransferFunction
+from .view.camera import Camera
+from .volume.mesh import TetMesh
+
+Array = jax.Array
+
+# An alpha that is nothing in 8 bits, and one that is hard to see.
+BLANK = 1 / 512
+FAINT = 1 / 50
+# Optical depth over the diagonal of the box below which a faint picture is put down to it.
+THIN = 0.05
+# The part of a range below which another one is taken for one in other units, if it also shows
+# less than this part of what the transfer function has.
+NARROW = 0.01
+ONE_COLOR = 0.05
+# An optical depth that shows a volume well: what the advised numbers aim at.
+VISIBLE = 2.0
+
+
+class ViewWarning(UserWarning):
+    """A picture that is probably not the one that was meant, with what it may come from.
+
+    `jaxvr.render` warns of a blank picture, of a field and a transfer function whose ranges do not
+    fit each other, and of a camera inside the volume. Where that is meant:
+    `warnings.filterwarnings("ignore", category=jaxvr.ViewWarning)`.
+    """
+
+
+def look(
+    volume: TetMesh, camera: Camera, transfer: TransferFunction, seen: Any, stacklevel: int
+) -> None:
+    """Warn of what is odd about a picture. All operands have the dtype of the volume.
+
+    seen (): the largest alpha of the picture, before its background. stacklevel: as for
+    `warnings.warn`, counted from the caller: 1 is the line that calls this.
+    """
+    floats = (volume.values, volume.points, camera.eye, camera.target, transfer.positions)
+    others = (camera.up, camera.fov, camera.extent, transfer.colors, transfer.extinctions)
+    if not is_concrete(seen, *floats, *others):
+        return
+    glance = np.asarray(_glance(camera.extent is not None, seen, *floats))
+    alpha, low, high, first, last, cut = (float(x) for x in glance)
+    apart = high < first or low > last
+    narrow = min(high - low, last - first) < NARROW * max(high - low, last - first)
+    if not (alpha < FAINT or apart or narrow or cut):
+        return
+    if not np.asarray(transfer.extinctions).any():
+        return  # nothing is to be seen, and nothing is
+    if alpha < FAINT:
+        message = _faint(volume, camera, transfer, alpha, (low, high))
+        if message:
+            warnings.warn(message, ViewWarning, stacklevel=stacklevel + 1)
+            return
+    for message in (
+        _ranges(volume, transfer, (low, high)) if apart or narrow else None,
+        _inside(volume, camera) if cut else None,
+    ):
+        if message:
+            warnings.warn(message, ViewWarning, stacklevel=stacklevel + 1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _glance(parallel, seen, values, points, eye, target, positions):
+    """The largest alpha, the ends of the values, the ends of the positions, and whether the eye
+    lies in the box of the points (or the plane of parallel rays cuts it)."""
+    # Eight points a row, which XLA reduces three times as fast as one.
+    rows = jnp.pad(points, ((0, -len(points) % 8), (0, 0)), mode="edge").reshape(-1, 24)
+    low = rows.min(axis=0).reshape(8, 3).min(axis=0)
+    high = rows.max(axis=0).reshape(8, 3).max(axis=0)
+    if parallel:
+        forward, middle = target - eye, (low + high) / 2 - eye
+        cut = jnp.abs(forward @ middle) < jnp.abs(forward) @ ((high - low) / 2)
+    else:
+        cut = ((low < eye) & (eye < high)).all()
+    ends = (seen, values.min(), values.max(), positions[0], positions[-1], cut)
+    return jnp.stack([jnp.asarray(x, points.dtype) for x in ends])
+
+
+def _faint(
+    volume: TetMesh,
+    camera: Camera,
+    transfer: TransferFunction,
+    alpha: float,
+    field: tuple[float, float],
+) -> str | None:
+    """Why next to nothing is seen; None where nothing is odd."""
+    blank = alpha < BLANK
+    points = _used(volume)
+    what = "The picture is blank" if blank else f"The picture is faint (largest alpha {alpha:.2g})"
+    if blank:
+        reason = _out_of_view(points, camera) or _ranges(volume, transfer, field)
+        if reason:
+            return f"{what}. {reason}"
+    strongest = float(_shown(volume, transfer, field)[:, 3].max())
+    if strongest == 0:
+        first, last = _ends(transfer)
+        return (
+            f"{what}. The transfer function, whose control points lie from {_range(first, last)}, "
+            f"has no extinction where the field lies, from {_range(*field)}. Move its positions or "
+            "raise its extinctions there."
+        )
+    diagonal = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+    depth = strongest * diagonal
+    if depth < THIN or (blank and alpha > 0):
+        found = -np.log1p(-alpha) if alpha > 0 else depth
+        return (
+            f"{what}. Extinction is per unit of length: the largest over the field's range is "
+            f"{strongest:.3g} and the volume's diagonal {diagonal:.3g}, which together is an "
+            f"optical depth of {depth:.2g}. If the numbers are opacities, use "
+            f"TransferFunction.from_opacity(..., unit_distance={_short(diagonal / 10)}); else "
+            f"transfer.scaled({_short(VISIBLE / found)}) makes the volume visible."
+        )
+    return None
+
+
+def _out_of_view(points: np.ndarray, camera: Camera) -> str | None:
+    """What keeps all points (P, 3) out of the picture: behind the camera, or beyond one side."""
+    eye, target, up = (np.asarray(v, np.float64) for v in (camera.eye, camera.target, camera.up))
+    forward = _unit(target - eye)
+    right = _unit(np.cross(forward, up))
+    offset = points - eye
+    depth, x, y = offset @ forward, offset @ right, offset @ np.cross(right, forward)
+    low, high = points.min(axis=0), points.max(axis=0)
+    box = f"its box reaches from {_vector(low)} to {_vector(high)}"
+    advice = (
+        f"Point it at the middle of the box, target={_vector((low + high) / 2)}, or take "
+        "Camera.orbit(volume)."
+    )
+    if (depth <= 0).all():
+        return (
+            f"The volume lies behind the camera, which stands at {_vector(eye)} and looks along "
+            f"{_vector(forward)}; {box}. {advice}"
+        )
+    if camera.fov is not None:
+        reach = depth * np.tan(np.deg2rad(float(camera.fov)) / 2)
+    else:
+        assert camera.extent is not None
+        reach = np.full_like(depth, float(camera.extent) / 2)
+    wide = reach * camera.width / camera.height
+    # A half-space that holds all points holds their hull, and so every cell.
+    sides = {
+        "right of": x > wide,
+        "left of": x < -wide,
+        "above": y > reach,
+        "below": y < -reach,
+    }
+    for side, beyond in sides.items():
+        if beyond.all():
+            return (
+                f"The volume lies {side} the picture; {box}, and the camera at {_vector(eye)} "
+                f"looks at {_vector(target)}. {advice}"
+            )
+    if (depth > 0).all():
+        pixel = 2 * reach / camera.height
+        size = max(float(np.ptp(x / pixel)), float(np.ptp(y / pixel)))
+        if size < 1:
+            return (
+                f"The volume is {size:.2g} pixels large; {box}, and the camera stands at "
+                f"{_vector(eye)}. Move it nearer, or take Camera.orbit(volume)."
+            )
+    return None
+
+
+def _ranges(volume: TetMesh, transfer: TransferFunction, field: tuple[float, float]) -> str | None:
+    """How the ranges of field and transfer function miss each other; None where they fit."""
+    low, high = field
+    first, last = _ends(transfer)
+    numbers = _numbers(transfer)
+    whole = np.ptp(numbers, axis=0)
+    if not whole.any():
+        return None  # the same everywhere: any range will do
+    ranges = (
+        f"The field lies from {_range(low, high)}, the control points of the transfer function "
+        f"from {_range(first, last)}"
+    )
+    advice = (
+        f"Are both in the same units? Give the transfer function positions from "
+        f"{_range(low, high)}, or convert the field with volume.replace(values=...)."
+    )
+    if high < first or low > last:
+        end, k = ("first", 0) if high < first else ("last", -1)
+        clear = " and no extinction" if numbers[k, 3] == 0 else ""
+        return f"{ranges}: all of the volume has the colour of the {end}{clear}. {advice}"
+    if 0 < high - low < NARROW * (last - first):
+        shown = np.ptp(_shown(volume, transfer, field), axis=0)
+        if (shown > ONE_COLOR * whole).any():
+            return None  # the control points crowd where the field is
+        part = 100 * (high - low) / (last - first)
+        return f"{ranges}, of which the field takes {part:.2g} %: it is of one colour. {advice}"
+    if 0 < last - first < NARROW * (high - low) and numbers[0, 3] > 0 and numbers[-1, 3] > 0:
+        # An end without extinction is a threshold or a peak, narrow on purpose.
+        values = np.asarray(volume.values)
+        part = float(((values >= first) & (values <= last)).mean())
+        if part < NARROW:
+            return (
+                f"{ranges}, where {100 * part:.2g} % of the values are: the others have the "
+                f"colours of its two ends. {advice}"
+            )
+    return None
+
+
+def _inside(volume: TetMesh, camera: Camera) -> str | None:
+    """That the camera stands in the volume, and what is not seen then."""
+    low, high = (np.asarray(x, np.float64) for x in volume.bounds())
+    eye, target = (np.asarray(x, np.float64) for x in (camera.eye, camera.target))
+    box = f"the volume's box, from {_vector(low)} to {_vector(high)}"
+    if camera.extent is None:
+        if not ((low < eye) & (eye < high)).all():
+            return None  # only points that no cell uses lie around it
+        what = f"The eye {_vector(eye)} lies inside {box}: what is behind it is not seen."
+    else:
+        forward = target - eye
+        if abs(forward @ ((low + high) / 2 - eye)) >= abs(forward) @ ((high - low) / 2):
+            return None
+        what = (
+            f"Parallel rays start in the plane through the eye {_vector(eye)}, which cuts {box}: "
+            "what is behind it is not seen."
+        )
+    return f"{what} Move the eye away from the target, or take Camera.orbit(volume)."
+
+
+def _used(volume: TetMesh) -> np.ndarray:
+    """The points (P, 3) that cells use, float64."""
+    used = np.zeros(volume.n_points, bool)
+    used[np.asarray(volume.cells)] = True
+    return np.asarray(volume.points, np.float64)[used]
+
+
+def _numbers(transfer: TransferFunction) -> np.ndarray:
+    """Colours and extinctions of the control points (K, 4), float64."""
+    extinctions = np.asarray(transfer.extinctions, np.float64)
+    return np.column_stack([np.asarray(transfer.colors, np.float64), extinctions])
+
+
+def _shown(volume: TetMesh, transfer: TransferFunction, field: tuple[float, float]) -> np.ndarray:
+    """What the field can take (n, 4) of the colours and extinctions: those at its two ends and
+    at the control points between them, or, where it is constant in cells, those at its values."""
+    positions, numbers = np.asarray(transfer.positions, np.float64), _numbers(transfer)
+    cellwise = volume.location == "cell"
+    at = np.asarray(volume.values, np.float64) if cellwise else np.array(field)
+    shown = np.stack([np.interp(at, positions, column) for column in numbers.T], axis=1)
+    within = (positions >= field[0]) & (positions <= field[1])
+    return shown if cellwise else np.concatenate([shown, numbers[within]])
+
+
+def _ends(transfer: TransferFunction) -> tuple[float, float]:
+    return float(transfer.positions[0]), float(transfer.positions[-1])
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v)
+
+
+def _range(low: float, high: float) -> str:
+    return f"{low:.6g} to {high:.6g}"
+
+
+def _vector(v: np.ndarray) -> str:
+    v = np.where(np.abs(v) > 1e-7 * np.abs(v).max(), v, 0.0)  # rounding, and -0
+    return "(" + ", ".join(f"{x:.4g}" for x in v) + ")"
+
+
+def _short(x: float) -> str:
+    """With two digits, and without an exponent where it can be."""
+    return f"{float(f'{x:.2g}'):g}"

@@ -1,0 +1,206 @@
+"""Eight common mistakes, made as users make them: each is told, with what to do about it."""
+
+from __future__ import annotations
+
+import re
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvr
+from jaxvr.hints import ViewWarning
+from jaxvr.volume import cells as zoo
+from jaxvr.volume.structured import grid_cells
+
+pytestmark = pytest.mark.usefixtures("quick_code")
+
+SIZE = {"width": 16, "height": 12}
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    """The unit cube with values from 0 to 1."""
+    return jaxvr.datasets.box((2, 2, 2), dtype="float32", field=lambda p: p[:, 0])
+
+
+@pytest.fixture(scope="module")
+def camera(mesh):
+    return jaxvr.Camera.orbit(mesh, **SIZE)
+
+
+def ramp(low=0.0, high=1.0, top=2.0):
+    return jaxvr.TransferFunction.from_colormap("viridis", [low, high], [0.5 * top, top])
+
+
+def told(*args, **kwargs) -> str:
+    """What one render warns of, once, on this very line of the caller."""
+    with pytest.warns(ViewWarning) as caught:
+        jaxvr.render(*args, **kwargs)
+    assert len(caught) == 1 and caught[0].filename == __file__
+    return str(caught[0].message)
+
+
+def test_wrong_field_name(mesh, tmp_path):
+    path = tmp_path / "box.vtu"
+    jaxvr.write_mesh(path, mesh)  # as "values"
+    with pytest.raises(ValueError, match=r"box.vtu has no field 'density'. It has 'values' .point"):
+        jaxvr.read_mesh(path, field="density")
+    with pytest.raises(ValueError, match="has no field 'Value'. Did you mean \"values\"[?] It has"):
+        jaxvr.read_mesh(path, field="Value")
+
+
+def test_nodes_in_another_order():
+    z, y, x = np.meshgrid(*[np.linspace(0, 1, 3)] * 3, indexing="ij")
+    points = np.stack([x.ravel(), y.ravel(), z.ravel()], 1)
+    cubes = grid_cells(3, 3, 3)
+    middle = points[cubes].mean(1)
+    right = {
+        "hexahedron": cubes,
+        "wedge": cubes[:, [[0, 2, 1, 4, 6, 5], [0, 3, 2, 4, 7, 6]]].reshape(-1, 6),
+        "pyramid": np.concatenate([cubes[:, :4], 27 + np.arange(8)[:, None]], 1),
+    }
+    points = np.concatenate([points, middle])
+    for kind, cells in right.items():
+        jaxvr.TetMesh.from_cells(points, {kind: cells}, points[:, 0], location="point")
+        for order in zoo.ORDERS[kind]:
+            wrong = cells[:, np.argsort(order)]
+            with pytest.raises(ValueError) as e:
+                jaxvr.TetMesh.from_cells(points, {kind: wrong}, points[:, 0], location="point")
+            assert f"{len(cells)} of {len(cells)} {kind} cells are twisted" in str(e.value)
+            columns = re.search(rf'{{"{kind}": cells\[:, \[([\d, ]+)\]\]}}', str(e.value))
+            assert columns, str(e.value)
+            assert np.array_equal(wrong[:, [int(c) for c in columns[1].split(",")]], cells)
+    voxels = {"voxel": cubes}  # in a hexahedron's order
+    with pytest.raises(ValueError, match=r'"hexahedron": cells\[:, \[0, 1, 2, 3, 4, 5, 6, 7\]\]'):
+        jaxvr.TetMesh.from_cells(points, voxels, points[:, 0], location="point")
+    unknown = cubes[:, [0, 6, 1, 3, 7, 2, 4, 5]]
+    with pytest.raises(ValueError, match=r"twisted.*not in VTK's order, which is one face [^{]*$"):
+        jaxvr.TetMesh.from_cells(points, {"hexahedron": unknown}, points[:, 0], location="point")
+
+
+def test_opacity_instead_of_extinction(mesh):
+    opacities = [0.1, 0.6]
+    transfer = jaxvr.TransferFunction([0.0, 1.0], [[0, 0, 1], [1, 1, 0]], opacities)
+    for size, what in ((0.001, "The picture is blank"), (0.01, "The picture is faint")):
+        small = mesh.replace(points=size * mesh.points)
+        camera = jaxvr.Camera.orbit(small, **SIZE)
+        message = told(small, camera, transfer)
+        assert message.startswith(what) and "0.6 and the volume's diagonal 0.0" in message
+        unit = re.search(r"from_opacity\(..., unit_distance=([\d.e-]+)\)", message)
+        factor = re.search(r"transfer.scaled\(([\d.e+]+)\)", message)
+        assert unit and factor
+        meant = jaxvr.TransferFunction.from_opacity(
+            transfer.positions, transfer.colors, opacities, float(unit[1])
+        )
+        for better in (meant, transfer.scaled(float(factor[1]))):
+            alpha = jaxvr.render(small, camera, better)[..., 3]
+            assert 0.5 < alpha.max() < 1
+    # Behind a background too, where alpha is 1 everywhere.
+    assert "opacities" in told(small.replace(points=0.1 * small.points),
+                               camera.replace(eye=0.1 * camera.eye, target=0.1 * camera.target),
+                               transfer, background=(1.0, 1.0, 1.0))  # fmt: skip
+
+
+def test_values_in_other_units(mesh, camera):
+    celsius, kelvin = mesh.replace(values=20 + 60 * mesh.values), ramp(293.15, 353.15)
+    message = told(celsius, camera, kelvin)
+    assert "field lies from 20 to 80" in message and "from 293.15 to 353.15" in message
+    assert "colour of the first" in message and "same units" in message
+    kilopascal, pascal = mesh.replace(values=101 * mesh.values), ramp(0, 101e3)
+    assert "field takes 0.1 %: it is of one colour" in told(kilopascal, camera, pascal)
+    other_way = mesh.replace(values=101e3 * mesh.values - 1)
+    assert "0 % of the values are" in told(other_way, camera, ramp(0, 101))
+    jaxvr.render(kilopascal, camera, ramp(0, 101))
+    # Control points far away, or close together, are no mistake where others are at work.
+    far = ramp().resample([-1e9, 0.0, 0.3, 1.0, 1e9])
+    jaxvr.render(mesh, camera, far)
+    peak = jaxvr.TransferFunction([0.499, 0.5, 0.501], np.ones((3, 3)), [0.0, 1e3, 0.0])
+    jaxvr.render(mesh, camera, peak)
+
+
+def test_camera_that_looks_away_or_stands_inside(mesh):
+    def look_at(eye, target):
+        return jaxvr.Camera.look_at(eye, target, **SIZE)
+
+    away = told(mesh, look_at((0.5, 0.5, 4), (0.5, 0.5, 8)), ramp())
+    assert "blank. The volume lies behind the camera, which stands at (0.5, 0.5, 4)" in away
+    assert "from (0, 0, 0) to (1, 1, 1)" in away and "target=(0.5, 0.5, 0.5)" in away
+    side = told(mesh, look_at((0.5, 0.5, 4), (9, 0.5, 3)), ramp())
+    assert "volume lies left of the picture" in side and "Camera.orbit" in side
+    wide = jaxvr.Camera.orthographic((0.5, 4, 4), (0.5, 4, 0), **SIZE)
+    assert "volume lies below the picture" in told(mesh, wide, ramp())
+    assert "pixels large" in told(mesh, look_at((0.5, 0.5, 4e4), (0.5, 0.5, 0)), ramp())
+    inside = told(mesh, look_at((0.5, 0.6, 0.7), (0.5, 0.5, 0)), ramp())
+    assert "eye (0.5, 0.6, 0.7) lies inside the volume's box, from (0, 0, 0) to (1, 1, 1)" in inside
+    cut = jaxvr.Camera.orthographic((0.5, 0.5, 0.5), (0.5, 0.5, 0), **SIZE)
+    assert "plane through the eye (0.5, 0.5, 0.5), which cuts" in told(mesh, cut, ramp())
+
+
+def test_integers(mesh):
+    blue = np.array([[0, 0, 255], [255, 255, 0]], np.uint8)
+    with pytest.raises(ValueError, match="colors holds integers up to 255.*Divide.*by 255"):
+        jaxvr.TransferFunction([0, 1], blue, [1, 2])
+    with pytest.raises(ValueError, match="colour table holds integers up to 255"):
+        jaxvr.TransferFunction.from_colormap(blue, [0, 1], [1, 2])
+    same = jaxvr.TransferFunction([0, 1], blue / 255, [1, 2], dtype="float32")
+    other = jaxvr.TransferFunction([0, 1], [[0, 0, 1], [1, 1, 0]], [1, 2], dtype="float32")
+    assert all(map(np.array_equal, jax.tree.leaves(same), jax.tree.leaves(other)))
+    labels = 2**24 + np.arange(mesh.n_points)
+    told = r"values has 13 integers that float32 cannot hold, the first is 16777217.*offset"
+    with pytest.warns(UserWarning, match=told) as caught:
+        mesh.replace(values=labels)
+    with pytest.warns(UserWarning, match=told) as again:
+        jaxvr.TetMesh.from_cells(mesh.points, {"hexahedron": grid_cells(3, 3, 3)}, labels)
+    assert len(caught) == len(again) == 1 and caught[0].filename == again[0].filename == __file__
+    mesh.replace(values=2 * (labels - 2**23))
+    with pytest.raises(ValueError, match="must hold integers, but has dtype float32"):
+        jaxvr.TetMesh.from_cells(
+            mesh.points, {"tetra": np.asarray(mesh.cells, np.float32)}, mesh.values
+        )
+
+
+def test_transfer_function_outside_of_the_field(mesh, camera):
+    message = told(mesh, camera, ramp(2, 3))
+    assert "field lies from 0 to 1" in message and "from 2 to 3" in message
+    assert "colour of the first" in message and "positions from 0 to 1" in message
+    empty = jaxvr.TransferFunction([-2.0, -1.0], np.eye(3)[:2], [1.0, 0.0])
+    message = told(mesh, camera, empty)
+    assert "picture is blank" in message and "of the last and no extinction" in message
+    gap = jaxvr.TransferFunction([-2.0, -1.0, 2.0, 3.0], np.ones((4, 3)), [1.0, 0.0, 0.0, 1.0])
+    assert "has no extinction where the field lies, from 0 to 1" in told(mesh, camera, gap)
+    # Cells have no values between theirs.
+    cellwise = mesh.replace(values=np.arange(mesh.n_tets) % 2)
+    between = jaxvr.TransferFunction([0.0, 0.5, 1.0], np.ones((3, 3)), [0.0, 1.0, 0.0])
+    assert "no extinction where the field lies" in told(cellwise, camera, between)
+
+
+def test_nan_in_the_data(mesh):
+    values = np.asarray(mesh.values).copy()
+    values[[3, 5]] = np.nan
+    with pytest.raises(ValueError, match="values has 2 NaN.*first at index 3. Remove or replace"):
+        jaxvr.TetMesh.from_cells(mesh.points, {"tetra": mesh.cells}, values)
+    with pytest.raises(ValueError, match="values has 2 NaN.*first at index 3. Remove or replace"):
+        mesh.replace(values=values)
+
+
+def test_what_is_no_mistake_gives_no_warning(mesh, camera):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jaxvr.render(mesh, camera, ramp())
+        jaxvr.render(mesh, camera, ramp().scaled(0.0))  # nothing, on purpose
+        constant = jaxvr.TransferFunction([7.0], [[1.0, 0.0, 0.0]], [2.0])
+        jaxvr.render(mesh, camera, constant)
+        jaxvr.render(mesh.replace(values=jnp.full(mesh.n_points, 0.5)), camera, ramp())
+
+
+def test_no_hints_while_tracing(mesh, camera):
+    off = ramp(2, 3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.jit(lambda t: jaxvr.render(mesh, camera, t))(off)
+        jax.grad(lambda t: jaxvr.render(mesh, camera, t).sum())(off)
+        jax.vmap(lambda s: jaxvr.render(mesh, camera, off.scaled(s)))(jnp.ones(2))
+        jaxvr.render(mesh, camera, off, status=True)
