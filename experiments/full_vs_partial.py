@@ -70,13 +70,13 @@ def run(
         out.mkdir(parents=True, exist_ok=True)
         shown = [name for name in pictures if "log" not in name and "nearest" not in name]
         row, column, side = (int(x * size) for x in WINDOW)
-        figure = plot.against(
+        axes = plot.against(
             [pictures[name] for name in shown],
             exact,
             [*shown, "Analytic"],
             window=(row, column, side),
         )
-        figure.savefig(out / "full_vs_partial.png", dpi=150)
+        axes.savefig(out / "full_vs_partial.png", dpi=150)
     return {
         "size": size,
         "tips": TIPS,

@@ -22,15 +22,13 @@ from matplotlib.image import imsave
 import jaxvr
 from experiments.common import table
 from experiments.havs import ORDERS, options, report, viewpoints, volumes
-
-# For people who see red and green alike they differ in lightness too.
-COLORS = np.array([[0, 0, 0], [20, 120, 60], [250, 210, 40], [200, 20, 30]], np.uint8)
+from jaxvr.plot.maps import K_COLORS
 
 
 def picture(found: jaxvr.KMap) -> np.ndarray:
     """Figure 6: (height, width, 3) uint8."""
     kind = 1 + (found.entries > 2).astype(int) + (found.entries > 6)
-    return COLORS[np.where(found.fragments > 0, kind, 0)]
+    return K_COLORS[np.where(found.fragments > 0, kind, 0)]
 
 
 def run(

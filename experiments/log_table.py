@@ -86,8 +86,8 @@ def run(
         if out is not None and pictures:
             out.mkdir(parents=True, exist_ok=True)
             titles = [f"{scale}, {nodes} x {nodes} x {shown}" for scale in pictures]
-            figure = plot.against(list(pictures.values()), exact, [*titles, "Analytic"])
-            figure.savefig(out / f"log_table_{name}.png", dpi=150)
+            axes = plot.against(list(pictures.values()), exact, [*titles, "Analytic"])
+            axes.savefig(out / f"log_table_{name}.png", dpi=150)
     return report
 
 

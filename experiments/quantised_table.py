@@ -74,13 +74,13 @@ def run(
             titles = ["8 bits", "16 bits", "float32", "Analytic"]
             titles[:3] = [f"{title}, {n}, {name}" for title in titles[:3]]
             row, column, side = (int(x * size) for x in WINDOW)
-            figure = plot.against(
+            axes = plot.against(
                 [pictures[8], pictures[16], pictures[None]],
                 exact,
                 titles,
                 window=(row, column, side),
             )
-            figure.savefig(out / f"quantised_table_{name}.png", dpi=150)
+            axes.savefig(out / f"quantised_table_{name}.png", dpi=150)
     print(table(report["tables"]), flush=True)
     return report
 

@@ -15,14 +15,14 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxvr._core.status import RenderError
+from jaxvr.defaults import DEPTH, default_transfer, diagonal
+from jaxvr.files import image_writer, save_image
 from jaxvr.fit import FitError, fit, noise
 from jaxvr.optics import TransferFunction
 from jaxvr.render import render
 from jaxvr.view import Camera
 from jaxvr.volume import TetMesh, list_fields, read_mesh, read_plot3d
 
-# A colour map's extinction rises from 0 to this over the diagonal of the volume's box.
-_DEPTH = 15.0
 _PLOT3D = {".xyz", ".x", ".g", ".grd", ".p3d", ".bin", ".q"}
 
 
@@ -31,7 +31,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = _parser()
     with warnings.catch_warnings():
         warnings.simplefilter("default")
-        warnings.showwarning = _say_warning
+        warnings.showwarning = _tell_once()
         try:
             arguments = parser.parse_args(argv)
             return arguments.run(arguments) or 0
@@ -62,10 +62,7 @@ def info(arguments: Any) -> None:
 def picture(arguments: Any) -> None:
     """One picture of a file."""
     out = Path(arguments.output)
-    if out.suffix.lower() not in (".png", ".npy"):
-        raise ValueError(f"The output must be .png or .npy, but is {str(out)!r}.")
-    if not out.parent.is_dir():
-        raise FileNotFoundError(f"There is no folder {str(out.parent)!r} to write in.")
+    image_writer(out)  # raises now what would be wrong with the path after all the work
     mesh = _mesh(arguments)
     transfer = _transfer(arguments.tf, mesh, arguments)
     camera = Camera.orbit(
@@ -78,12 +75,7 @@ def picture(arguments: Any) -> None:
         height=arguments.height,
     )
     image = np.asarray(render(mesh, camera, transfer, background=arguments.background))
-    if out.suffix.lower() == ".npy":
-        np.save(out, image)
-    else:
-        from jaxvr import plot
-
-        plot.save_png(out, image)
+    save_image(out, image)
     print(f"{out}  {image.shape[1]} x {image.shape[0]}, mean alpha {image[..., 3].mean():.3f}")
 
 
@@ -144,37 +136,21 @@ def _is_plot3d(arguments: Any) -> bool:
     return arguments.q is not None or Path(arguments.file).suffix.lower() in _PLOT3D
 
 
-def _diagonal(mesh: TetMesh) -> float:
-    lo, hi = (np.asarray(x, np.float64) for x in mesh.bounds())
-    return float(np.linalg.norm(hi - lo))
-
-
 def _typical(transfer: TransferFunction, mesh: TetMesh) -> float:
     mean = float(np.asarray(transfer.extinctions, np.float64).mean())
-    return mean if mean > 0 else _DEPTH / _diagonal(mesh)
+    return mean if mean > 0 else DEPTH / diagonal(mesh)
 
 
 def _transfer(source: str, mesh: TetMesh, arguments: Any) -> TransferFunction:
     """From a JSON file, or a colour map over the range of the mesh's values."""
-    lo, hi = (float(x) for x in (mesh.values.min(), mesh.values.max()))
     if source.lower().endswith(".json") or os.path.sep in source:
         if not Path(source).is_file():
             raise FileNotFoundError(f"There is no file {source!r}.")
         transfer = TransferFunction.from_json(
             Path(source), unit_distance=arguments.unit_distance, dtype=mesh.dtype
         )
-        first, last = (float(transfer.positions[k]) for k in (0, -1))
-        if last < lo or first > hi:
-            warnings.warn(
-                f"The transfer function spans {first:g} to {last:g}, the field {lo:g} to {hi:g}: "
-                "the volume has one colour.",
-                stacklevel=1,
-            )
     else:
-        positions = np.linspace(lo, hi, 33) if hi > lo else np.array([lo])
-        ramp = np.linspace(0, 1, len(positions)) if hi > lo else np.ones(1)
-        extinctions = (_DEPTH / _diagonal(mesh) * ramp).astype(mesh.dtype)
-        transfer = TransferFunction.from_colormap(source, positions, extinctions, dtype=mesh.dtype)
+        transfer = default_transfer(mesh, source)
     return transfer.scaled(arguments.opacity)
 
 
@@ -235,7 +211,7 @@ def _parser() -> argparse.ArgumentParser:
         *("-o", "--output"),
         required=True,
         metavar="FILE",
-        help=".png, or .npy with the float image (premultiplied linear RGBA)",
+        help=".png, or .npy or .exr with the float image (premultiplied linear RGBA)",
     )
 
     made = command("fit", recover, "Recover a transfer function from pictures, from noise.")
@@ -268,8 +244,16 @@ class _Parser(argparse.ArgumentParser):
         raise SystemExit(2)
 
 
-def _say_warning(message: Any, category: Any, *_: Any, **__: Any) -> None:
-    _say("warning", message)
+def _tell_once() -> Any:
+    """Tells a warning once, wherever it comes from: a fit renders in several places."""
+    told: set[str] = set()
+
+    def tell(message: Any, category: Any, *_: Any, **__: Any) -> None:
+        if str(message) not in told:
+            told.add(str(message))
+            _say("warning", message)
+
+    return tell
 
 
 def _say(what: str, message: Any) -> None:

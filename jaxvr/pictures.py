@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxvr import plot
+from jaxvr.files import save_image
 from jaxvr.optics.transfer import TransferFunction
 
 
@@ -39,13 +40,14 @@ def save_fit(
     out = []
     for name, image in images.items():
         out.append(path / f"{name}.png")
-        plot.save_png(out[-1], image, background=background)
-    figures = {
+        save_image(out[-1], image, background=background)
+    drawn = {
         "difference": plot.difference(images["fitted"], images["target"], title="fitted - target"),
-        "transfer": plot.plot_transfer(transfer, reference=reference),
-        "overview": plot.comparison(list(images.values()), list(images), background=background),
+        "transfer": plot.transfer(transfer, reference=reference),
+        "overview": plot.compare(list(images.values()), list(images), background=background),
     }
-    for name, figure in figures.items():
+    for name, axes in drawn.items():
         out.append(path / f"{name}.png")
-        figure.savefig(out[-1], dpi=150)
+        # Pictures as they are need their figure's own resolution.
+        axes.savefig(out[-1], dpi=150 if name == "transfer" else "figure")
     return out

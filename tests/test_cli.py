@@ -87,7 +87,7 @@ def test_fit(mesh, tf, tmp_path, capsys):
         (["render", "MESH", "-o", "OUT/a.png", "--tf", "virids"], "Did you mean viridis"),
         (["render", "MESH", "-o", "OUT/a.png", "--tf", "no.json"], "no file 'no.json'"),
         (["render", "MESH", "-o", "OUT/a.png", "--tf", "MESH/x.json"], "There is no file"),
-        (["render", "MESH", "-o", "OUT/a.jpg"], ".png or .npy"),
+        (["render", "MESH", "-o", "OUT/a.jpg"], ".png, .npy or .exr"),
         (["render", "MESH", "-o", "OUT/none/a.png"], "There is no folder"),
         (["render", "MESH", "-o", "OUT/a.png", "--field", "heat"], "no field 'heat'"),
         (["render", "MESH", "-o", "OUT/a.png", "--zoom", "0"], "zoom"),
@@ -121,7 +121,7 @@ def test_warnings_are_one_line(mesh, tf, tmp_path, capsys):
     jaxvr.TransferFunction([50.0, 60.0], np.ones((2, 3)), [1.0, 2.0]).to_json(far)
     assert main(["render", mesh, "--tf", str(far), "-o", str(tmp_path / "a.npy"), *SMALL]) == 0
     lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and lines[0].startswith("jaxvr: warning: The transfer function spans")
+    assert len(lines) == 1 and lines[0].startswith("jaxvr: warning: The field lies from")
 
 
 @pytest.mark.parametrize("command", [[], ["info"], ["render"], ["fit"]])

@@ -13,6 +13,7 @@ import pytest
 
 import jaxvr
 from experiments import (
+    beside_vtk,
     control_points,
     demo,
     fit_transfer,
@@ -176,7 +177,12 @@ def kbuffer_refine_change(folder: Path) -> float:
     return max(row["change"] for row in rows)
 
 
+def beside_vtk_error(folder: Path) -> float:
+    return beside_vtk.main(["--tiny", "--out", str(folder)])["rows"][0]["max"]
+
+
 EXPERIMENTS = [
+    (beside_vtk_error, 0, 0.1),
     (k_requirements_entries, 1, 10),
     (kbuffer_exact_error, 1e-10, 1e-5),
     (kbuffer_speed_rate, 0.1, 10),
