@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvr._core.brief import dtype_of, is_known, length_of
 from jaxvr._core.checks import (
     as_floats,
     common_float,
@@ -36,6 +37,7 @@ class TransferFunction:
 
     positions (K,):   scalar values, never decreasing; two equal ones are a jump, three an error.
     colors (K, 3):    linear RGB; any finite number (above 1 for lights brighter than white).
+        Integers above 1 are an error, since they are taken for 8-bit colours.
     extinctions (K,): per unit of length, >= 0, any size.
 
     The three share one dtype: that of the arrays passed, JAX's default float for plain numbers, or
@@ -51,6 +53,7 @@ class TransferFunction:
     def __init__(self, positions: Any, colors: Any, extinctions: Any, *, dtype: Any = None):
         dtype = common_float(dtype, positions, colors, extinctions)
         positions = as_floats("positions", positions, ndim=1, dtype=dtype)
+        _require_unit_colors("colors", colors)
         colors = as_floats("colors", colors, ndim=2, dtype=dtype)
         extinctions = as_floats("extinctions", extinctions, ndim=1, dtype=dtype)
         k = positions.shape[0]
@@ -108,6 +111,8 @@ class TransferFunction:
         positions = np.asarray(as_floats("positions", positions, ndim=1, dtype=np.float64))
         require_finite("positions", positions)
         _require_sorted(positions)
+        if not isinstance(colormap, str) and not callable(colormap):
+            _require_unit_colors("The colour table", colormap)
         colors = colormaps.sample(colormap, _span(positions), srgb=srgb)
         tf = TransferFunction(positions.astype(dtype), colors.astype(dtype), extinctions)
         if points is None:
@@ -252,6 +257,20 @@ class TransferFunction:
         """The dtype of the three fields."""
         return np.dtype(self.positions.dtype)
 
+    def __repr__(self) -> str:
+        # leaves may be tracers or placeholders
+        x, e = self.positions, self.extinctions
+        known = ""
+        if is_known(x, e) and x.ndim == 1 and x.size and e.size:
+            x, e = np.asarray(x), np.asarray(e)
+            known = f"{x[0]:.6g} to {x[-1]:.6g}, extinction up to {e.max():.6g}, "
+        return f"TransferFunction({length_of(x)} control points, {known}{dtype_of(x)})"
+
+    def _repr_html_(self) -> str | None:
+        from jaxvr.optics.html import transfer_html
+
+        return transfer_html(self)  # None: notebooks show the repr
+
     def to_json(self, path: str | os.PathLike[str] | None = None) -> str:
         """JSON text that gives the same numbers back; also written to `path` if there is one."""
         from jaxvr.optics import transfer_json
@@ -285,6 +304,50 @@ class TransferFunction:
             srgb=srgb,
             dtype=dtype,
         )
+
+    @staticmethod
+    def from_vtk(
+        color: Any,
+        opacity: Any = None,
+        unit_distance: float | None = None,
+        *,
+        convention: str = "unstructured",
+        points: int = 256,
+        dtype: Any = None,
+    ) -> TransferFunction:
+        """From VTK's functions or PyVista's, with every node of both as a control point.
+
+        color, opacity: a vtkColorTransferFunction and a vtkPiecewiseFunction, with midpoints,
+            sharpness and colour spaces; or one vtkVolumeProperty or volume that has both (what
+            PyVista's `add_volume` returns); or a vtkLookupTable, pyvista.LookupTable for one or
+            for both.
+        unit_distance, convention: what an opacity means, as in `from_opacity`; `None` takes the
+            property's scalar opacity unit distance, or 1. In the "unstructured" convention
+            opacities may exceed 1, as in VTK.
+        points: about how many control points to add where a curve is not linear.
+        dtype: defaults to JAX's default float.
+
+        With clamping off there is a jump to 0 at either end. Raises ValueError for other objects,
+        functions without nodes, and opacities that `from_opacity` does not take.
+        """
+        from jaxvr.optics import transfer_vtk
+
+        return transfer_vtk.read(
+            color, opacity, unit_distance, convention=convention, points=points, dtype=dtype
+        )
+
+    def to_vtk(self, unit_distance: float = 1.0) -> tuple[Any, Any]:
+        """A vtkColorTransferFunction and a vtkPiecewiseFunction for unstructured grids.
+
+        The opacities are extinction * unit_distance; give the same number to the property, with
+        `SetScalarOpacityUnitDistance`. Jumps are two nodes at one place. `from_vtk` gives the same
+        numbers back, to rounding where `unit_distance` is no power of two. Raises ValueError where
+        an opacity would exceed 1, with a unit distance that is small enough. Needs VTK:
+        `pip install 'jaxvr[peers]'`.
+        """
+        from jaxvr.optics import transfer_vtk
+
+        return transfer_vtk.write(self, unit_distance)
 
 
 @functools.partial(jax.jit, static_argnames="side")
@@ -346,6 +409,21 @@ def _require_nonnegative(extinctions: Any) -> None:
         raise ValueError(
             f"Extinctions must not be negative, but {int((e < 0).sum())} of {len(e)} are, the "
             f"first extinctions[{k}] = {e[k]:g}."
+        )
+
+
+def _require_unit_colors(name: str, colors: Any) -> None:
+    """ValueError for whole numbers that can only be 0 to 255: a light of 255 times white."""
+    if not is_concrete(colors) or np.dtype(getattr(colors, "dtype", int)).kind not in "iu":
+        return
+    try:
+        c = np.asarray(colors)
+    except (TypeError, ValueError):
+        return  # said by whoever reads them
+    if c.dtype.kind in "iu" and c.size and c.max() > 1:
+        raise ValueError(
+            f"{name} holds integers up to {c.max()}, but 1 is full intensity. Divide 8-bit colours "
+            "by 255; for lights brighter than white pass floats."
         )
 
 

@@ -7,7 +7,8 @@ jaxvr's format holds each number with as many digits as give the same float back
 
 ParaView exports a list of colour maps, each with "RGBPoints" (x, r, g, b, ...), "ColorSpace" (RGB,
 HSV, Lab, Diverging or Step) and perhaps "Points" (x, opacity, midpoint, sharpness, ...), read here
-as vtkColorTransferFunction and vtkPiecewiseFunction interpret them. All nodes of both become
+as vtkColorTransferFunction and vtkPiecewiseFunction interpret them (`sample_curves`, which serves
+`transfer_vtk` too). All nodes of both become
 control points, so nothing between two colour nodes is lost; where ParaView's curve is not linear in
 RGB and opacity, control points are added between the nodes. "NanColor" is ignored, since scalars
 are finite, and so are "IndexedColors" beside "RGBPoints".
@@ -81,9 +82,9 @@ def read(
     if isinstance(document, dict) and "format" in document:
         return _own(document, dtype)
     entry = _choose(document, name)
-    nodes, colors, space = _color_nodes(entry)
-    curve = _opacity_nodes(entry, nodes)
-    positions, colors, opacities = _sample(nodes, colors, space, curve, points, dtype)
+    nodes, space = _color_nodes(entry)
+    curve = _opacity_nodes(entry, nodes[:, 0])
+    positions, colors, opacities = sample_curves(nodes, space, curve, points, dtype)
     if srgb:
         colors = colormaps.srgb_to_linear(colors)
     make = _transfer_class().from_opacity
@@ -160,7 +161,8 @@ def _choose(document: Any, name: str | None) -> dict[str, Any]:
     return entries[0]
 
 
-def _color_nodes(entry: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, str]:
+def _color_nodes(entry: dict[str, Any]) -> tuple[np.ndarray, str]:
+    """(n, 6): x, r, g, b, midpoint, sharpness, of which ParaView writes the first four."""
     if "RGBPoints" not in entry:
         if "IndexedColors" in entry:
             raise ValueError("This colour map is categorical (IndexedColors): it has no positions.")
@@ -172,7 +174,7 @@ def _color_nodes(entry: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, str]:
     if not isinstance(space, str) or space not in colormaps.SPACES:
         known = ", ".join(colormaps.SPACES)
         raise ValueError(f"ColorSpace {space!r} cannot be read, only {known}.")
-    return nodes[:, 0], nodes[:, 1:], space
+    return np.column_stack([nodes, np.full(len(nodes), 0.5), np.zeros(len(nodes))]), space
 
 
 def _opacity_nodes(entry: dict[str, Any], nodes: np.ndarray) -> np.ndarray:
@@ -182,8 +184,6 @@ def _opacity_nodes(entry: dict[str, Any], nodes: np.ndarray) -> np.ndarray:
     curve = _quadruples(entry, "Points")
     if (curve[:, 1] < 0).any() or (curve[:, 1] > 1).any():
         raise ValueError(f"The opacities of 'Points' must lie in [0, 1], but are {curve[:, 1]}.")
-    curve[:, 2] = np.clip(curve[:, 2], 1e-5, 1 - 1e-5)  # as VTK does
-    curve[:, 3] = np.clip(curve[:, 3], 0, 1)
     return curve
 
 
@@ -197,18 +197,28 @@ def _quadruples(entry: dict[str, Any], key: str) -> np.ndarray:
     return rows
 
 
-def _sample(
-    nodes: np.ndarray, colors: np.ndarray, space: str, curve: np.ndarray, points: int, dtype: Any
+def sample_curves(
+    nodes: np.ndarray, space: str, curve: np.ndarray, points: int, dtype: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Control points that follow both curves: positions, colours, opacities."""
-    x, _, mid, sharp = curve.T
-    middle = x[:-1] + mid[:-1] * np.diff(x)
-    at = [nodes, x, middle[(mid[:-1] != 0.5) | (sharp[:-1] > 0.99)]]
-    curved = []  # intervals that straight lines would not follow
-    if space not in ("RGB", "Step"):
-        curved += list(zip(nodes[:-1], nodes[1:], strict=True))
-    for k in np.flatnonzero((sharp[:-1] >= 0.01) & (sharp[:-1] <= 0.99)):
-        curved += [(x[k], middle[k]), (middle[k], x[k + 1])]
+    """Control points that follow both curves: positions, colours, opacities.
+
+    nodes (n, 6): x, r, g, b, midpoint, sharpness of vtkColorTransferFunction; space: of `SPACES`.
+    curve (m, 4): x, opacity, midpoint, sharpness of vtkPiecewiseFunction. Both ascend by x, and two
+    nodes at one x are a jump. points, dtype: as in `read`.
+    """
+    nodes, curve = _bounded(nodes), _bounded(curve)
+    at, curved = [], []  # control points, and intervals that straight lines would not follow
+    for rows, mixing in ((nodes, space), (curve, "RGB")):
+        x, mid, sharp = rows[:-1, 0], rows[:-1, -2], rows[:-1, -1]
+        following = rows[1:, 0]
+        middle = x + mid * (following - x)
+        bends = (sharp >= 0.01) & (sharp <= 0.99)
+        bends |= (sharp < 0.01) & (mixing not in ("RGB", "Step"))
+        broken = (mid != 0.5) | (sharp >= 0.01) | (mixing == "Diverging")  # at the middle
+        at += [rows[:, 0], middle[broken]]
+        for k in np.flatnonzero(bends & (following > x)):
+            halves = [(x[k], middle[k]), (middle[k], following[k])]
+            curved += halves if broken[k] else [(x[k], following[k])]
     if curved:
         if points < 1:
             raise ValueError(f"points must be at least 1, but is {points}.")
@@ -216,9 +226,7 @@ def _sample(
         at += [np.linspace(lo, hi, each + 2) for lo, hi in curved]
     grid = np.unique(np.concatenate(at))
     both = [
-        np.column_stack(
-            [_colors_at(nodes, colors, space, grid, side), _opacity_at(curve, grid, side)]
-        )
+        np.column_stack([_colors_at(nodes, space, grid, side), _opacity_at(curve, grid, side)])
         for side in ("left", "right")
     ]
     jumps = np.abs(both[0] - both[1]).max(axis=1) > 1e-12
@@ -247,32 +255,49 @@ def _interval(x: np.ndarray, s: np.ndarray, side: Any) -> tuple[np.ndarray, np.n
     return lo, hi, np.where(width > 0, (s - x[lo]) / np.where(width > 0, width, 1), 0.0)
 
 
-def _colors_at(
-    nodes: np.ndarray, colors: np.ndarray, space: str, s: np.ndarray, side: str
-) -> np.ndarray:
-    lo, hi, t = _interval(nodes, s, side)
-    if space == "Step":
-        return colors[hi]
-    mixed = colormaps.interpolate(space, colors[lo], colors[hi], t)
+def _bounded(rows: np.ndarray) -> np.ndarray:
+    """Rows whose last two numbers are midpoint and sharpness, in the range that VTK keeps to."""
+    out = np.array(rows, np.float64)
+    out[:, -2] = np.clip(out[:, -2], 1e-5, 1 - 1e-5)
+    out[:, -1] = np.clip(out[:, -1], 0, 1)
+    return out
+
+
+def _between(
+    rows: np.ndarray, s: np.ndarray, side: str, hermite: bool = True
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nodes on both sides of `s`, and what part of the second one VTK's curve takes there.
+
+    The midpoint warps the fraction of the interval, the sharpness bends the curve.
+    """
+    lo, hi, t = _interval(rows[:, 0], s, side)
+    mid, sharp = rows[lo, -2], rows[lo, -1]
+    at_middle = s == rows[lo, 0] + mid * (rows[hi, 0] - rows[lo, 0])
+    t = np.where(t < mid, 0.5 * t / mid, 0.5 + 0.5 * (t - mid) / (1 - mid))
+    upper = (t >= 0.5) & ~at_middle if side == "left" else (t >= 0.5) | at_middle
+    power = 1.0 + 10.0 * sharp
+    bent = np.where(t < 0.5, 0.5 * (2 * t) ** power, 1 - 0.5 * (2 * (1 - t)) ** power)
+    if hermite:  # with the ends' slopes flattened by the sharpness
+        b2, b3 = bent**2, bent**3
+        bent = 3 * b2 - 2 * b3 + (1 - sharp) * (2 * b3 - 3 * b2 + bent)
+    part = np.select([lo == hi, sharp < 0.01, sharp > 0.99], [0.0 * t, t, 1.0 * upper], bent)
+    return lo, hi, np.clip(part, 0, 1)  # clips rounding only
+
+
+def _colors_at(nodes: np.ndarray, space: str, s: np.ndarray, side: str) -> np.ndarray:
+    """vtkColorTransferFunction between nodes."""
+    lo, hi, t = _between(nodes, s, side, hermite=space != "Diverging")
+    below, above = nodes[lo, 1:4], nodes[hi, 1:4]
+    if space == "Step":  # at the node below, and at the middle if it is sharp
+        return np.where(((nodes[lo, 5] > 0.99) & (t < 1))[:, None], below, above)
+    mixed = colormaps.interpolate(space, below, above, t)
     # A conversion to another space and back would round the nodes' own colours.
-    mixed = np.where((t == 1.0)[:, None], colors[hi], mixed)
-    return np.where((t == 0.0)[:, None], colors[lo], mixed)
+    mixed = np.where((t == 1.0)[:, None], above, mixed)
+    return np.where((t == 0.0)[:, None], below, mixed)
 
 
 def _opacity_at(curve: np.ndarray, s: np.ndarray, side: str) -> np.ndarray:
-    """vtkPiecewiseFunction between nodes: the midpoint warps t, the sharpness bends the curve."""
-    lo, hi, t = _interval(curve[:, 0], s, side)
-    y1, y2, mid, sharp = curve[lo, 1], curve[hi, 1], curve[lo, 2], curve[lo, 3]
-    at_middle = s == curve[lo, 0] + mid * (curve[hi, 0] - curve[lo, 0])
-    t = np.where(t < mid, 0.5 * t / mid, 0.5 + 0.5 * (t - mid) / (1 - mid))
-    linear = y1 + t * (y2 - y1)
-    upper = (t >= 0.5) & ~at_middle if side == "left" else (t >= 0.5) | at_middle
-    step = np.where(upper, y2, y1)
-    power = 1.0 + 10.0 * sharp
-    bent = np.where(t < 0.5, 0.5 * (2 * t) ** power, 1 - 0.5 * (2 * (1 - t)) ** power)
-    # Hermite with the ends' slopes flattened by the sharpness.
-    b2, b3 = bent**2, bent**3
-    slope = (1 - sharp) * (y2 - y1)
-    hermite = (2 * b3 - 3 * b2 + 1) * y1 + (3 * b2 - 2 * b3) * y2 + (2 * b3 - 3 * b2 + bent) * slope
-    hermite = np.clip(hermite, np.minimum(y1, y2), np.maximum(y1, y2))
-    return np.select([lo == hi, sharp < 0.01, sharp > 0.99], [y1, linear, step], hermite)
+    """vtkPiecewiseFunction between nodes."""
+    lo, hi, t = _between(curve, s, side)
+    below, above = curve[lo, 1], curve[hi, 1]
+    return np.where(t == 1.0, above, below + t * (above - below))

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvr._core.brief import brief, dtype_of
 from jaxvr._core.checks import (
     as_floats,
     common_float,
@@ -174,10 +175,43 @@ class Camera:
             for k in range(n)
         ]
 
+    @staticmethod
+    def from_vtk(
+        source: Any, width: int | None = None, height: int | None = None, dtype: Any = None
+    ) -> Camera:
+        """The view of a vtkCamera, a pyvista.Camera, a vtkRenderer or a pyvista.Plotter.
+
+        width, height: in pixels; `None` takes those of the plotter's or renderer's window, or 512
+            for a camera alone.
+
+        A parallel projection becomes an orthographic camera with extent = 2 * parallel scale. The
+        clipping range is ignored. `jaxvr.view.camera_vtk` says how pixels lie in both. Raises
+        ValueError for other objects and for skewed projections (a window centre, a view shear).
+        """
+        from jaxvr.view import camera_vtk
+
+        return camera_vtk.read(source, width, height, dtype)
+
+    def to_vtk(self, into: Any = None) -> Any:
+        """This view as a new vtkCamera, or set in the camera, renderer or plotter `into`.
+
+        Returns the vtkCamera. `camera.to_vtk(plotter)` sets a pyvista.Plotter's camera and the size
+        of its window. VTK makes view up a unit vector. Needs VTK: `pip install 'jaxvr[peers]'`.
+        """
+        from jaxvr.view import camera_vtk
+
+        return camera_vtk.write(self, into)
+
     @property
     def dtype(self) -> np.dtype:
         """The dtype of the rays."""
         return np.dtype(self.eye.dtype)
+
+    def __repr__(self) -> str:
+        # leaves may be tracers or placeholders
+        kind = "extent" if self.fov is None else "fov"
+        parts = ", ".join(f"{n}={brief(getattr(self, n))}" for n in ("eye", "target", "up", kind))
+        return f"Camera({parts}, {self.width} x {self.height} pixels, {dtype_of(self.eye)})"
 
     def replace(self, **changes: Any) -> Camera:
         """This camera with some fields changed, checked as the factories do.

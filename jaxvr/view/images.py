@@ -18,7 +18,8 @@ Array = jax.Array
 
 
 def psnr(a: Any, b: Any, peak: float = 1.0) -> Array:
-    """Peak signal-to-noise ratio () in dB, 10 log10(peak^2 / mean squared difference).
+    """Peak signal-to-noise ratio () of images a and b in dB, 10 log10(peak^2 / mean squared
+    difference).
 
     The mean is over all entries, alpha included if there is one. Equal images give +inf, with a
     derivative of zero. Raises ValueError for different shapes and for empty images.
@@ -35,7 +36,8 @@ def ssim(a: Any, b: Any, peak: float = 1.0) -> Array:
     Wang et al., "Image quality assessment: from error visibility to structural similarity" (2004):
     an 11 x 11 Gaussian window of standard deviation 1.5 pixels, weights summing to one and so
     without Bessel's correction, K1 = 0.01, K2 = 0.03, only windows that lie inside the picture.
-    `a` and `b` are (H, W) or (H, W, C), both sides at least 11, else ValueError.
+    `a` and `b` are (H, W) or (H, W, C), both sides at least 11, else ValueError. peak: what is full
+    intensity.
     """
     a, b = _pair(a, b)
     if a.ndim not in (2, 3) or min(a.shape[:2]) < 11:

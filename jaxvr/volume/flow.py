@@ -36,7 +36,8 @@ def cylinder_flow(
 ) -> TetMesh:
     """The ring between a cylinder and a wider one, with potential flow along x through it.
 
-    n: cells outwards, around and along the axis z. Rings are spaced geometrically, so that cells
+    radius, outer, length: of the two cylinders, in world units; their axis is z. n: cells outwards,
+    around and along it. Rings are spaced geometrically, so that cells
     keep their shape. circulation: of the flow, clockwise, in units of speed times length.
     field: "speed" (0 at the stagnation points, 2 at the sides without circulation) or "pressure",
         the coefficient 1 - speed^2.

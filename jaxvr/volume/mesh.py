@@ -15,7 +15,7 @@ from .._core.checks import as_floats, require_finite, require_shape
 from .._core.pytree import pytree, static
 from .build import build
 from .report import MeshReport
-from .values import choose_location, place
+from .values import choose_location, place, rounded
 
 Array = jax.Array
 
@@ -82,10 +82,40 @@ class TetMesh:
         dropped and inverted ones turned round, with one warning that counts both.
 
         Raises ValueError for arrays of the wrong shape or kind, indices out of range, NaN or
-        infinite numbers, an unknown cell type, faces with three or more cells, cells given twice,
-        values that fit nothing or more than one location, and where no cells are left.
+        infinite numbers, an unknown cell type, cells that are mostly twisted as their nodes are in
+        another order, faces with three or more cells, cells given twice, values that fit nothing or
+        more than one location, and where no cells are left. Warns of integer values that float32
+        cannot hold.
         """
         return _from_cells(cls, points, cells, values, location, dtype, None, stacklevel=3)
+
+    @classmethod
+    def from_pyvista(
+        cls, grid: Any, field: str | None = None, *, location: str | None = None, dtype: Any = None
+    ) -> TetMesh:
+        """A mesh from a grid of PyVista or VTK: unstructured, structured, rectilinear, image data.
+
+        field, location, dtype: as in `jaxvr.read_mesh`; `None` takes the grid's active scalars if
+            they have one component, else its first scalar field, point fields before cell fields.
+
+        Zoo cells are subdivided as in `from_cells`; cells that VTK does not draw (blanked or ghost
+        cells) are left out. Nothing is shared with the grid. Raises ValueError for anything that is
+        no grid, has no such field (with those it has), or fails `from_cells`.
+        """
+        from .vtk_grid import read_grid
+
+        return read_grid(cls, grid, field, location, dtype)
+
+    def to_pyvista(self) -> Any:
+        """A pyvista.UnstructuredGrid of the tetrahedra (positively oriented), its field active.
+
+        The field has the name it was read by, or "values". Corner data becomes point data on points
+        of each tetrahedron's own; `from_pyvista` welds those, so faces and pictures are the same.
+        Needs PyVista: `pip install 'jaxvr[peers]'`.
+        """
+        from .vtk_grid import write_grid
+
+        return write_grid(self)
 
     def replace(self, *, values: Any = None, points: Any = None, location: Any = None) -> TetMesh:
         """The same connectivity with new floats; works under `jit` and `grad`.
@@ -114,22 +144,28 @@ class TetMesh:
         with np.errstate(over="ignore"):  # too large for the dtype is infinite, and found below
             out = as_floats(name, x, dtype=self.points.dtype)
         require_finite(name, out)  # looks only where the numbers are known
+        if name == "values" and (message := rounded(name, x, self.dtype)):
+            warnings.warn(message, UserWarning, stacklevel=3)
         return jnp.asarray(out)
 
     @property
     def dtype(self) -> np.dtype:
+        """That of points and values."""
         return np.dtype(self.points.dtype)
 
     @property
     def n_points(self) -> int:
+        """Number P of points."""
         return self.points.shape[0]
 
     @property
     def n_tets(self) -> int:
+        """Number T of tetrahedra."""
         return self.cells.shape[0]
 
     @property
     def n_boundary(self) -> int:
+        """Number F of faces without a neighbour."""
         return self.boundary.shape[0]
 
     @property
@@ -155,6 +191,11 @@ class TetMesh:
         points = getattr(self.points, "shape", ("?",))
         return f"TetMesh({shape[0]} tets, {points[0]} points, {self.location} data)"
 
+    def _repr_html_(self) -> str | None:
+        from .html import mesh_html
+
+        return mesh_html(self)  # None: notebooks show the repr
+
 
 def _from_cells(
     cls: type[TetMesh],
@@ -168,9 +209,9 @@ def _from_cells(
 ) -> TetMesh:
     built = build(points, cells, dtype, field)
     placed, where = place(values, built, location)
-    message = built.report.warning()
-    if message:
-        warnings.warn(message, UserWarning, stacklevel=stacklevel)
+    for message in (built.report.warning(), rounded("values", values, placed.dtype)):
+        if message:
+            warnings.warn(message, UserWarning, stacklevel=stacklevel)
     return cls(
         points=jnp.asarray(built.points),
         values=jnp.asarray(placed),

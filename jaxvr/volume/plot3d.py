@@ -178,6 +178,7 @@ def read_plot3d(
 ) -> TetMesh:
     """The volume of a PLOT3D grid: its hexahedra, cut into tetrahedra, with a field of the q file.
 
+    xyz_path, q_path: the files of the grid and of the solution.
     field: "density" (the default), "energy", "pressure" (ideal gas, gamma = 1.4), "speed",
         "momentum.x", .y, .z, .magnitude or "velocity.x", .y, .z, in the file's (dimensionless)
         units. Without a q file: a coordinate, "x" (the default), "y" or "z".
