@@ -1,0 +1,121 @@
+"""`Orbit`: a camera as a hand moves it, round a target, by angles, distance and shifts."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from jaxvr.view.camera import Camera
+
+# Straight up or down a picture has no upper side.
+STEEPEST = 89.0
+ZOOMS = (0.05, 100.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Orbit:
+    """Where from: angles in degrees about `axes`, as in `Camera.orbit`.
+
+    target (3,): a point in the middle of the picture. axes (3, 3): the directions that azimuth 90,
+    elevation 90 and neither look from; the second is up. zoom: at 1 a ball of that radius fits the
+    picture. fov: full vertical angle in degrees of a pinhole; None for parallel rays, which start
+    at `distance` from the target.
+    """
+
+    target: np.ndarray
+    axes: np.ndarray
+    azimuth: float
+    elevation: float
+    zoom: float
+    radius: float
+    fov: float | None
+    distance: float
+
+    @staticmethod
+    def of(camera: Camera, radius: float) -> Orbit:
+        """The orbit that a camera is on, for a volume in a ball of that radius."""
+        eye, target, up = (
+            np.asarray(v, np.float64) for v in (camera.eye, camera.target, camera.up)
+        )
+        axes = _axes(up)
+        out = eye - target
+        distance = float(np.linalg.norm(out))
+        x, y, z = axes @ (out / distance)
+        if camera.fov is not None:
+            fov = float(camera.fov)
+            zoom = radius / math.sin(math.radians(fov) / 2) / distance
+        else:
+            fov, zoom = None, 2 * radius / float(np.asarray(camera.extent))
+        return Orbit(
+            target,
+            axes,
+            azimuth=math.degrees(math.atan2(x, z)),
+            elevation=_between(math.degrees(math.asin(_between(y, -1, 1))), -STEEPEST, STEEPEST),
+            zoom=zoom,
+            radius=radius,
+            fov=fov,
+            distance=distance,
+        )
+
+    def turned(self, azimuth: float, elevation: float) -> Orbit:
+        """By degrees; the elevation stays below 90, the azimuth in [-180, 180)."""
+        return dataclasses.replace(
+            self,
+            azimuth=(self.azimuth + azimuth + 180) % 360 - 180,
+            elevation=_between(self.elevation + elevation, -STEEPEST, STEEPEST),
+        )
+
+    def zoomed(self, factor: float) -> Orbit:
+        """Closer by a factor above 0."""
+        return dataclasses.replace(self, zoom=_between(self.zoom * factor, *ZOOMS))
+
+    def shifted(self, right: float, up: float) -> Orbit:
+        """The picture moves by parts of its height, and the target the other way."""
+        side, true_up, _ = self._basis()
+        if self.fov is None:
+            height = 2 * self.radius / self.zoom
+        else:
+            height = 2 * self._away() * math.tan(math.radians(self.fov) / 2)
+        return dataclasses.replace(
+            self, target=self.target - height * (right * side + up * true_up)
+        )
+
+    def camera(self, width: int, height: int, dtype: Any = None) -> Camera:
+        """The view with that many pixels."""
+        eye = self.target + self._away() * self._basis()[2]
+        up = self.axes[1]
+        if self.fov is not None:
+            return Camera.look_at(eye, self.target, up, self.fov, width, height, dtype=dtype)
+        extent = 2 * self.radius / self.zoom
+        return Camera.orthographic(eye, self.target, up, extent, width, height, dtype=dtype)
+
+    def _away(self) -> float:
+        """From the target to the eye."""
+        if self.fov is None:
+            return self.distance
+        return self.radius / math.sin(math.radians(self.fov) / 2) / self.zoom
+
+    def _basis(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Right and up in the picture, and the direction from the target to the eye."""
+        a, e = math.radians(self.azimuth), math.radians(self.elevation)
+        x, y, z = self.axes
+        out = math.cos(e) * (math.sin(a) * x + math.cos(a) * z) + math.sin(e) * y
+        side = math.cos(a) * x - math.sin(a) * z
+        return side, np.cross(out, side), out
+
+
+def _axes(up: np.ndarray) -> np.ndarray:
+    """A right-handed frame (3, 3) whose second row is up: the world's own where up is y."""
+    y = up / np.linalg.norm(up)
+    world = np.eye(3)[[2, 0, 1]]
+    z = world[np.argmin(np.abs(world @ y))]
+    z = z - (z @ y) * y
+    z /= np.linalg.norm(z)
+    return np.stack([np.cross(y, z), y, z])
+
+
+def _between(x: float, low: float, high: float) -> float:
+    return min(max(float(x), low), high)

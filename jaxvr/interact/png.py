@@ -1,0 +1,27 @@
+"""Images as PNG files, pixel for pixel."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+
+from jaxvr.view.images import to_uint8, unpremultiply
+
+
+def encode(image: Any, level: int = 6) -> bytes:
+    """The bytes of a PNG file, eight bits a channel.
+
+    image (H, W, 4): premultiplied linear RGBA, stored with straight alpha; where all of it is
+    opaque the file has none. The numbers are taken as they are, as `jaxvr.plot` does. level: 0 to
+    9, from fast to small; it is lossless always.
+    """
+    from PIL import Image  # matplotlib needs it too, but loading it takes a while
+
+    image = np.asarray(image)
+    opaque = bool((image[..., 3] == 1).all())
+    pixels = to_uint8(image[..., :3] if opaque else np.asarray(unpremultiply(image)))
+    out = io.BytesIO()
+    Image.fromarray(pixels).save(out, format="PNG", compress_level=level)
+    return out.getvalue()
