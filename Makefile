@@ -1,8 +1,10 @@
-# make demo   fit a transfer function on a generated mesh; pictures and a report in output/demo
-# make test   lint, then all tests (sets up everything it needs)
-# make lint   ruff and pyright only
-# make venv   the environment with all development tools, in .venv
-# make clean  remove the environment, caches and outputs
+# make demo       fit a transfer function on a generated mesh; pictures and a report in output/demo
+# make test       lint, then all tests (sets up everything it needs)
+# make lint       ruff and pyright only
+# make docs       the documentation as a site, in output/site
+# make notebooks  run the notebooks and keep their pictures
+# make venv       the environment with all development tools, in .venv
+# make clean      remove the environment, caches and outputs
 #
 # PYTHON picks the interpreter (3.11 or newer):  make test PYTHON=python3.12
 
@@ -12,7 +14,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint venv clean
+.PHONY: demo test lint docs notebooks venv clean
 
 demo: $(VENV)/.package
 	$(BIN)/python -m experiments.demo --out output/demo
@@ -23,6 +25,13 @@ test: lint
 lint: $(VENV)/.tools
 	$(BIN)/ruff check .
 	$(BIN)/pyright
+
+docs: $(VENV)/.docs
+	$(BIN)/python -m notebooks.site
+	$(BIN)/mkdocs build --strict --quiet --config-file .mkdocs.yml
+
+notebooks: $(VENV)/.docs
+	$(BIN)/python -m notebooks.run
 
 venv: $(VENV)/.tools
 
@@ -36,6 +45,10 @@ $(VENV)/.package: pyproject.toml
 
 $(VENV)/.tools: $(VENV)/.package
 	$(PIP) install --editable '.[dev]'
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.package
+	$(PIP) install --editable '.[docs,notebooks,peers]'
 	@touch $@
 
 clean:

@@ -12,15 +12,20 @@ has no gradient, depths and scalars are arithmetic on local data and have one. A
 shade many, since segments do not depend on the transfer function.
 
 Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, `view`, `optics`,
-`order`, `trace`, `composite`, `native`, `adjoint`, `render`, `fit`, `plot`, `cli`. Those of
-`native` are compiled loops, which serve where they can with the same results.
+`order`, `trace`, `composite`, `native`, `adjoint`, `defaults`, `hints`, `render`, `probe`, `fit`,
+`files`, `plot`, `pictures`, `interact`, `cli`. Those of `native` are compiled loops, which serve
+where they can with the same results.
 """
 
 from jaxvr import native, order
 from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay
 from jaxvr.composite import Over
+from jaxvr.defaults import default_transfer
+from jaxvr.files import save_animation, save_image, turntable
 from jaxvr.fit import FitError, FitResult, fit, fit_parameters
+from jaxvr.hints import ViewWarning
+from jaxvr.interact import explore, load_ipython_extension, unload_ipython_extension
 from jaxvr.optics import (
     Analytic,
     AverageColor,
@@ -30,6 +35,7 @@ from jaxvr.optics import (
     Quadrature,
     TransferFunction,
 )
+from jaxvr.probe import Probe, probe
 from jaxvr.render import render, render_rays, shade, trace
 from jaxvr.trace import (
     Fragments,
@@ -67,6 +73,7 @@ __all__ = [
     "Over",
     "PartialPreIntegration",
     "PreIntegration",
+    "Probe",
     "Quadrature",
     "RayCast",
     "RenderError",
@@ -74,14 +81,19 @@ __all__ = [
     "Segments",
     "TetMesh",
     "TransferFunction",
+    "ViewWarning",
     "check",
     "datasets",
+    "default_transfer",
+    "explore",
     "fit",
     "fit_parameters",
     "list_fields",
+    "load_ipython_extension",
     "measure_k",
     "native",
     "order",
+    "probe",
     "psnr",
     "rasterize",
     "read_mesh",
@@ -89,9 +101,13 @@ __all__ = [
     "refine",
     "render",
     "render_rays",
+    "save_animation",
+    "save_image",
     "shade",
     "ssim",
     "trace",
+    "turntable",
+    "unload_ipython_extension",
     "write_mesh",
 ]
 __version__ = "0.1.0"
