@@ -151,9 +151,12 @@ class Box(NamedTuple):
     high: Array
 
 
-def outline(beam: Beam, corners: tuple[Array, Array, Array], live: Array) -> tuple[Outline, Box]:
-    """Outlines of faces with corners (3, N) each, from the beam's origin, and boxes round them. No
-    ray may meet faces that are not in `live` (N,)."""
+def outline(beam: Beam, corners: Array, live: Array) -> tuple[Outline, Box]:
+    """Outlines of faces, and boxes round them.
+
+    corners (3, 3, N): coordinates, by corner, from the beam's origin. live (N,): no ray may meet
+    the others.
+    """
     # Barriers keep XLA from computing all of this again for each of the twelve numbers.
     held = lax.optimization_barrier
     eps = jnp.finfo(corners.dtype).eps

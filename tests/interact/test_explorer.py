@@ -335,11 +335,10 @@ def test_bad_arguments_say_so(mesh, change):
 
 @pytest.fixture
 def explorer(mesh, monkeypatch):
-    pytest.importorskip("anywidget")
     from jaxvr.interact import explore
 
     camera = jaxvr.Camera.orbit(mesh, width=SIZE, height=SIZE)
-    widget = explore(mesh, TRANSFER, camera, coarse=8)
+    widget: Any = explore(mesh, TRANSFER, camera, coarse=8)
     sent: Any = []
     monkeypatch.setattr(
         widget, "send", lambda content, buffers=None: sent.append((content, buffers))

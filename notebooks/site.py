@@ -1,0 +1,87 @@
+"""Collects the pages of the documentation, laid out as in the repository, for mkdocs to build.
+
+    python -m notebooks.site       # to output/docs; `make docs` builds output/site from it
+
+Pages are the README, what stands in notebooks/ and experiments/, and a reference that lists each
+public name by room; its text is the docstrings, so there is nothing to keep in step.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import shutil
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+SUFFIXES = {".md", ".ipynb", ".png", ".gif", ".json", ".cff"}
+# Pages of the reference, in order: their titles, and of which modules the public names are.
+PAGES = {
+    "Rendering": ("render", "probe", "hints", "_core", "defaults"),
+    "Volumes": ("volume",),
+    "Cameras and pictures": ("view", "files"),
+    "Transfer functions and integrators": ("optics",),
+    "Tracers and orders": ("trace", "order"),
+    "Compositors and adjoints": ("composite", "adjoint", "native"),
+    "Fitting": ("fit",),
+    "Plots": ("plot",),
+    "Notebooks": ("interact",),
+}
+
+
+def public() -> dict[str, list[str]]:
+    """Dotted names of everything public, by page of the reference."""
+    import jaxvr
+    import jaxvr.plot
+
+    page_of = {room: page for page, rooms in PAGES.items() for room in rooms}
+    found: dict[str, list[str]] = {page: [] for page in PAGES}
+    for name in jaxvr.__all__:
+        thing = getattr(jaxvr, name)
+        if inspect.ismodule(thing):
+            room = thing.__name__.split(".")[1]
+            names = [f"{thing.__name__}.{x}" for x in getattr(thing, "__all__", ())]
+            found[page_of[room]] += names or [thing.__name__]
+        else:
+            found[page_of[thing.__module__.split(".")[1]]].append(where(thing))
+    found["Plots"] += [where(getattr(jaxvr.plot, x)) for x in jaxvr.plot.__all__]
+    found["Fitting"].append("jaxvr.fit.parameters")
+    return found
+
+
+def where(thing: Any) -> str:
+    """The dotted name under which a class or function is defined."""
+    return f"{thing.__module__}.{thing.__qualname__}"
+
+
+def collect(out: Path) -> None:
+    """Writes all pages to a folder, which is made anew."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    text = (ROOT / "README.md").read_text()
+    (out / "index.md").write_text(text)
+    shutil.copy(ROOT / "CITATION.cff", out / "CITATION.cff")
+    for folder in ("notebooks", "experiments"):
+        for file in (ROOT / folder).iterdir():
+            if file.suffix in SUFFIXES:
+                (out / folder).mkdir(exist_ok=True)
+                shutil.copy(file, out / folder / file.name)
+    reference = out / "reference"
+    reference.mkdir()
+    for page, names in public().items():
+        lines = [f"# {page}", ""]
+        for name in names:
+            lines += [f"::: {name}", ""]
+        file = reference / f"{page.lower().replace(' ', '_')}.md"
+        file.write_text("\n".join(lines))
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=ROOT / "output" / "docs")
+    collect(parser.parse_args(arguments).out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,152 @@
+"""What users read: every code block works as printed, every link leads somewhere, and every public
+name is documented."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+
+import jaxvr
+import jaxvr.plot
+from jaxvr import cli
+from notebooks.site import collect, public
+
+ROOT = Path(__file__).resolve().parents[1]
+OTHERS = sorted([*ROOT.glob("notebooks/*.md"), *ROOT.glob("experiments/*.md")])
+PAGES = [ROOT / "README.md", *OTHERS]
+GUIDES = [p for p in PAGES if p.parent.name != "experiments"]
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The code blocks of a page in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.M | re.S)
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("page", [p for p in GUIDES if blocks(p, "python")], ids=name_of)
+def test_code_blocks_run_as_printed(page, tmp_path, monkeypatch):
+    """One after the other, as somebody does who copies them."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    update = importlib.import_module("jax").config.update
+    kept = {"jax_compilation_cache_dir": None, "jax_persistent_cache_min_compile_time_secs": 1.0}
+    names: dict[str, object] = {}
+    try:
+        for number, code in enumerate(blocks(page, "python")):
+            exec(compile(code, f"{page.name}, block {number}", "exec"), names)
+    finally:
+        for key, value in kept.items():
+            update(key, value)
+        update("jax_enable_x64", True)
+
+
+def test_commands_of_the_readme_run_as_printed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    mesh = jaxvr.datasets.box((3, 3, 3))
+    data: dict[str, Any] = {"cells": {"tetra": np.asarray(mesh.cells)}}
+    data |= {"point_data": {"density": np.asarray(mesh.values)}}
+    meshio.Mesh(np.asarray(mesh.points), **data).write("file.vtu")
+    commands = [
+        line
+        for block in blocks(ROOT / "README.md", "sh")
+        for line in block.splitlines()
+        if line.startswith("jaxvr ")
+    ]
+    assert len(commands) == 3
+    for command in commands:
+        assert cli.main(shlex.split(command)[1:]) == 0, capsys.readouterr().err
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
+    assert (tmp_path / "folder" / "transfer.json").exists()
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings, as repository pages make them."""
+    headings = re.findall(r"^#+ +(.*)$", page.read_text(), re.M)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).strip().replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page):
+    for text, target in re.findall(r"\[([^\]]*)\]\(([^)\s]+)\)", page.read_text()):
+        if re.match(r"[a-z]+:", target):
+            continue
+        file, _, anchor = target.partition("#")
+        at = (page.parent / file).resolve() if file else page
+        assert at.exists(), f"{page.name}: [{text}]({target})"
+        if anchor:
+            assert anchor in anchors(at), f"{page.name}: [{text}]({target})"
+
+
+def test_every_experiment_and_notebook_is_linked():
+    text = "".join(p.read_text() for p in PAGES)
+    for file in [*ROOT.glob("notebooks/*.ipynb"), *OTHERS]:
+        assert file.name in text, f"no page links to {file.name}"
+
+
+def resolve(dotted: str):
+    """The module, class or function of a dotted name."""
+    parts = dotted.split(".")
+    for cut in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:cut]))
+        except ImportError:
+            continue
+        for part in parts[cut:]:
+            found = getattr(found, part)
+        return found
+    raise AssertionError(dotted)
+
+
+PUBLIC = sorted({name for names in public().values() for name in names})
+
+
+@pytest.mark.parametrize("dotted", PUBLIC)
+def test_public_names_are_documented(dotted):
+    """The thing itself, its methods and properties, and each argument by its name."""
+    thing = resolve(dotted)
+    text = inspect.getdoc(thing) or ""
+    assert len(text) > 30, f"{dotted} has no docstring"
+    if inspect.isfunction(thing):
+        require_arguments(dotted, thing, text)
+    if not inspect.isclass(thing):
+        return
+    for name, member in vars(thing).items():
+        if name.startswith("_") or name.startswith("tree_"):
+            continue
+        function = getattr(member, "__func__", member)
+        if isinstance(member, property):
+            assert inspect.getdoc(member), f"{dotted}.{name} has no docstring"
+        elif inspect.isfunction(function):
+            own = inspect.getdoc(getattr(thing, name)) or ""
+            assert own, f"{dotted}.{name} has no docstring"
+
+
+def require_arguments(dotted, function, text):
+    module = inspect.getmodule(function)
+    assert module is not None
+    room = importlib.import_module(".".join(module.__name__.split(".")[:2]))
+    pages = text + (inspect.getdoc(module) or "") + (inspect.getdoc(room) or "")
+    for other in re.findall(r"as (?:for )?`(\w+)`", text):
+        pages += inspect.getdoc(getattr(jaxvr, other, getattr(jaxvr.plot, other, None))) or ""
+    for name, parameter in inspect.signature(function).parameters.items():
+        if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+            assert re.search(rf"\b{name}\b", pages), f"{dotted}: nothing is said of {name!r}"
+
+
+def test_the_site_has_all_pages(tmp_path):
+    collect(tmp_path / "docs")
+    reference = "".join(p.read_text() for p in (tmp_path / "docs" / "reference").iterdir())
+    for dotted in PUBLIC:
+        assert f"::: {dotted}\n" in reference
+    assert (tmp_path / "docs" / "notebooks" / "choices.md").exists()
