@@ -44,9 +44,8 @@ def compare(volume: Any, name: str, camera: Any, smaller: bool) -> list[dict[str
     reference = gradients(volume, camera, transfer, jaxvr.RayCast(), weights)
     k = jaxvr.measure_k(volume, camera).k
     tried: list[tuple[int, Any]] = [(k, "cells")]
-    tried += [(max(k // 2, 1), "cells")]
     if smaller:
-        tried += [(k, "closest"), (6, "cells"), (2, "cells")]
+        tried += [(max(k // 2, 1), "cells"), (k, "closest"), (6, "cells"), (2, "cells")]
     rows = []
     for entries, pairs in tried:
         tracer = jaxvr.KBuffer(k=entries, pairs=pairs)

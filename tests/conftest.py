@@ -68,6 +68,14 @@ def quick_code():
         yield
 
 
+@pytest.fixture
+def quick_jit(quick_code, monkeypatch):
+    """So do functions that code of users, or `fit`, passes to `jax.jit` meanwhile."""
+    import quick
+
+    monkeypatch.setattr(jax, "jit", quick.outermost_jit)
+
+
 @pytest.fixture(scope="module", params=["compiled", "jax"])
 def loops(request):
     """Runs a module with compiled loops, and again with JAX's own: `native=None` is either."""

@@ -15,6 +15,7 @@ import jax
 
 from jaxvr._core.checks import is_concrete
 
+PLAIN = jax.jit
 EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 jit = functools.partial(jax.jit, compiler_options=EMITTERS | {"xla_backend_optimization_level": 0})
 # With LLVM's optimiser, which fuses products and sums: where those may be rounded once or twice.
@@ -32,6 +33,22 @@ STATIC = {
     "jaxvr.probe": {"_prepare": (0,), "_count": (0,), "_walk": (0, 1)},
     "jaxvr.trace.measure": {"_measure": (0, 1)},
 }
+
+
+def outermost_jit(function: Any = None, **options: Any) -> Any:
+    """A stand-in for `jax.jit` that compiles quickly what is not called within another `jit`."""
+    if function is None:
+        return functools.partial(outermost_jit, **options)
+    own, quick = PLAIN(function, **options), jit(function, **options)
+
+    @functools.wraps(function)
+    def call(*args, **more):
+        concrete = is_concrete(*jax.tree.leaves((args, more)))
+        return (quick if concrete else own)(*args, **more)
+
+    for name in ("lower", "_cache_size", "clear_cache"):
+        setattr(call, name, getattr(quick, name))
+    return call
 
 
 class Verb:

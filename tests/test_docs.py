@@ -35,7 +35,7 @@ def name_of(path: Path) -> str:
 
 
 @pytest.mark.parametrize("page", [p for p in GUIDES if blocks(p, "python")], ids=name_of)
-def test_code_blocks_run_as_printed(page, tmp_path, monkeypatch):
+def test_code_blocks_run_as_printed(page, tmp_path, monkeypatch, quick_jit):
     """One after the other, as somebody does who copies them."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TMPDIR", str(tmp_path))
@@ -51,7 +51,7 @@ def test_code_blocks_run_as_printed(page, tmp_path, monkeypatch):
         update("jax_enable_x64", True)
 
 
-def test_commands_of_the_readme_run_as_printed(tmp_path, monkeypatch, capsys):
+def test_commands_of_the_readme_run_as_printed(tmp_path, monkeypatch, capsys, quick_jit):
     monkeypatch.chdir(tmp_path)
     mesh = jaxvr.datasets.box((3, 3, 3))
     data: dict[str, Any] = {"cells": {"tetra": np.asarray(mesh.cells)}}

@@ -206,5 +206,5 @@ EXPERIMENTS = [
 @pytest.mark.parametrize(
     ("run", "low", "high"), EXPERIMENTS, ids=lambda x: getattr(x, "__name__", "")
 )
-def test_experiment(run, low, high, tmp_path):
+def test_experiment(run, low, high, tmp_path, quick_jit):
     assert low < run(tmp_path / "out") < high
