@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments import gradients
 
-pytestmark = pytest.mark.usefixtures("loops")
+pytestmark = pytest.mark.usefixtures("loops", "quick_jit")
 
 HARD = ("plain", "eye inside", "jump", "extinction 0", "constant field", "depth 1e4")
 
