@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from typing import Any
 
 import jax
 import pytest
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("quick_jit")
 def shell():
     """A fresh IPython, without a terminal or a history."""
     InteractiveShell.clear_instance()
-    shell = InteractiveShell.instance()
+    shell: Any = InteractiveShell.instance()
     shell.display_formatter.active_types = ["text/plain", "text/html", "image/png"]
     yield shell
     shell.run_line_magic("unload_ext", "jaxvr")
