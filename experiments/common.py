@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 import jaxvr
+from jaxvr.defaults import diagonal
 
 # Centre, width and height of shells of density, as parts of the range and of the highest.
 PEAKS = (
@@ -109,12 +110,6 @@ def machine() -> dict[str, Any]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     versions = {"python": platform.python_version(), "jax": jax.__version__}
     return {"cores": cores, "processor": model, "device": jax.devices()[0].platform} | versions
-
-
-def diagonal(volume: Any) -> float:
-    """Of the bounding box, in world units."""
-    lo, hi = (np.asarray(x, np.float64) for x in volume.bounds())
-    return float(np.linalg.norm(hi - lo))
 
 
 def shells(

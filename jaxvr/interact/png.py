@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxvr.view.images import to_uint8, unpremultiply
+from jaxvr.files import pixels
 
 
 def encode(image: Any, level: int = 6) -> bytes:
@@ -21,7 +21,8 @@ def encode(image: Any, level: int = 6) -> bytes:
 
     image = np.asarray(image)
     opaque = bool((image[..., 3] == 1).all())
-    pixels = to_uint8(image[..., :3] if opaque else np.asarray(unpremultiply(image)))
     out = io.BytesIO()
-    Image.fromarray(pixels).save(out, format="PNG", compress_level=level)
+    Image.fromarray(pixels(image[..., :3] if opaque else image)).save(
+        out, format="PNG", compress_level=level
+    )
     return out.getvalue()

@@ -145,17 +145,16 @@ class Outline(NamedTuple):
 
 class Box(NamedTuple):
     """Where the beam sees faces (N,): bounds (2, N) of x and y, with room for rounding; all of the
-    plane for a face without an image, and nothing for one that is not to be met."""
+    plane for a face without an image."""
 
     low: Array
     high: Array
 
 
-def outline(beam: Beam, corners: Array, live: Array) -> tuple[Outline, Box]:
+def outline(beam: Beam, corners: Array) -> tuple[Outline, Box]:
     """Outlines of faces, and boxes round them.
 
-    corners (3, 3, N): coordinates, by corner, from the beam's origin. live (N,): no ray may meet
-    the others.
+    corners (3, 3, N): coordinates, by corner, from the beam's origin.
     """
     # Barriers keep XLA from computing all of this again for each of the twelve numbers.
     held = lax.optimization_barrier
@@ -165,7 +164,7 @@ def outline(beam: Beam, corners: Array, live: Array) -> tuple[Outline, Box]:
     size = jnp.sum(jnp.abs(corners), axis=0)
     w = jnp.where(beam.pinhole, depth, 1)
     near = w > 1e-3 * size  # or its image is too far off to be of use
-    ahead = live & beam.narrow & (jnp.all(near, axis=0) | ~beam.pinhole)
+    ahead = beam.narrow & (jnp.all(near, axis=0) | ~beam.pinhole)
     w = jnp.where(near, w, 1)
     x, y = right / w, up / w
     blur = ROUNDINGS * eps * (size / w + 1) * (reach + jnp.abs(x) + jnp.abs(y))
@@ -178,16 +177,14 @@ def outline(beam: Beam, corners: Array, live: Array) -> tuple[Outline, Box]:
     slack = 4 * d[None] * (length + d[None])
     slack = slack + 4 * eps * (jnp.abs(to_x * y_i) + jnp.abs(to_y * x_i))
     slack = slack + 4 * (d * (high_x - low_x + high_y - low_y))[None]
-    # Without an image all three are zero; where nothing is to be met, their signs differ.
+    # Without an image all three are zero, and any ray may meet the face.
     scale = held(jnp.where(ahead[None], 1 / slack, 0))
     a, b, c = -to_y * scale, to_x * scale, (to_y * x_i - to_x * y_i) * scale
-    never = jnp.array([2, -2, 0], c.dtype)[:, None]
-    far = jnp.where(live, jnp.inf, -jnp.inf).astype(c.dtype)[None]
     box = Box(
-        jnp.where(ahead[None], jnp.stack([low_x, low_y]) - 2 * d[None], -far),
-        jnp.where(ahead[None], jnp.stack([high_x, high_y]) + 2 * d[None], far),
+        jnp.where(ahead[None], jnp.stack([low_x, low_y]) - 2 * d[None], -jnp.inf),
+        jnp.where(ahead[None], jnp.stack([high_x, high_y]) + 2 * d[None], jnp.inf),
     )
-    return Outline(a, b, jnp.where(live[None], c, never)), box
+    return Outline(a, b, c), box
 
 
 def overlaps(box: Box, low: Array, high: Array) -> Array:

@@ -364,8 +364,8 @@ def _list_faces(stream: Stream, source: FaceSource, beam: Beam, first, end) -> _
         slot = selection.faces[row, 1]
         ids = source.corners(jnp.where(live, slot, 0))
         points = coordinates_of(source.vertices, ids) - beam.origin[:, None, None]
-        face, box = outline(beam, points, live)
-        valid = overlaps(box, low, high)
+        face, box = outline(beam, points)
+        valid = overlaps(box, low, high) & live[None]
         ranks, found = jax.vmap(_places)(valid)
         to = strip * size + jnp.where(valid, out.count[:, None] + ranks, strips * size)
         some = [jnp.broadcast_to(x[None], valid.shape) for x in (number, slot)]
