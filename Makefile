@@ -36,19 +36,25 @@ notebooks: $(VENV)/.docs
 venv: $(VENV)/.tools
 
 # Each stamp is older than pyproject.toml when that has changed, and the installation is then redone.
-$(VENV)/.package: pyproject.toml
+# Byte code is left to the first import of a module: most of what is installed is never imported.
+INSTALL = $(PIP) install --no-compile --editable
+
+$(VENV)/.made:
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "jaxvr needs Python 3.11 or newer, but %s is %d.%d: pass PYTHON=..." % (sys.executable, *v[:2]))'
 	@echo "Setting up $(VENV) ..."
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) install --editable .
 	@touch $@
 
-$(VENV)/.tools: $(VENV)/.package
-	$(PIP) install --editable '.[dev]'
+$(VENV)/.package: pyproject.toml | $(VENV)/.made
+	$(INSTALL) .
 	@touch $@
 
-$(VENV)/.docs: $(VENV)/.package
-	$(PIP) install --editable '.[docs,notebooks,peers]'
+$(VENV)/.tools: pyproject.toml | $(VENV)/.made
+	$(INSTALL) '.[dev]'
+	@touch $@
+
+$(VENV)/.docs: pyproject.toml | $(VENV)/.made
+	$(INSTALL) '.[docs,notebooks,peers]'
 	@touch $@
 
 clean:

@@ -1,5 +1,5 @@
 """Compiling in a third of the time, for tests of what is computed and not of how it is rounded:
-those of exactness, lost rays, speed and memory keep what users get.
+those of exactness, lost rays and speed keep what users get. (What XLA reserves is decided before.)
 
 Compiling is nearly all the time that the tests take. Left out are LLVM's optimiser, and XLA's
 emitters by way of MLIR, which set up a compiler for each kernel; its older ones do the same.

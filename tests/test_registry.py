@@ -114,7 +114,7 @@ def derivative(
 
 
 def compare(found, same_integrator, exact, entry):
-    """All adjoints agree with `Direct`, and all integrators with `Analytic`, as far as they say."""
+    """All adjoints agree with another one, and all integrators with `Analytic`, as far as they say."""
     image, slopes = found
     assert np.isfinite(image).all() and image[..., 3].max() > 0.3
     assert np.allclose(image, same_integrator[0], atol=1e-12)
@@ -136,7 +136,9 @@ def test_same_image_and_gradient(tracer, integrator, adjoint, location):
     everything = integrator.name == "Analytic"  # integrators do not see geometry
     found = derivative(tracer.name, integrator.name, adjoint.name, location, everything)
     reference = tracer.follows or tracer.name
-    same = derivative(reference, integrator.name, "Direct", location, everything)
+    # By one mode against another: what records for reverse mode is the slowest to compile.
+    other = "Direct" if everything else "Forward"
+    same = derivative(reference, integrator.name, other, location, everything)
     exact = derivative("RayCast", "Analytic", "Direct", location, everything)
     compare(found, same, exact, integrator)
 

@@ -16,6 +16,8 @@ import jaxvr
 from jaxvr.optics import AbstractSlabIntegrator
 from tests.adjoint.schedule import iterations
 
+pytestmark = pytest.mark.usefixtures("quick_code")
+
 # Eight control points of no extinction among twelve; the box has values from 0 to 1.
 TAU = np.array([0, 0, 0, 0, 0, 0, 2.0, 1.0, 0, 0, 3.0, 3.0])
 WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(5, 6, 4)))

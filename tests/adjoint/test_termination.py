@@ -19,6 +19,8 @@ from jaxvr.numerics import compensated
 from jaxvr.volume import datasets
 from tests.adjoint.schedule import iterations
 
+pytestmark = pytest.mark.usefixtures("quick_code")
+
 LIMIT = 0.05
 WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(5, 6, 4)))
 

@@ -17,6 +17,8 @@ import jaxvr
 from jaxvr import native
 from jaxvr.numerics.rules import rule_for, thin_rule
 
+pytestmark = pytest.mark.usefixtures("quick_jit")
+
 EPS = {"float32": 5e-7, "float64": 1e-14}
 
 
