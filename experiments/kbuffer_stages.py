@@ -25,6 +25,7 @@ from experiments.havs import options, report, viewpoints, volumes
 from jaxvr.trace import stream as streams
 from jaxvr.trace.entry import search
 from jaxvr.trace.rasterize import triangle_source
+from jaxvr.trace.select import Sort, next_selection, sort_first, start_selection
 from jaxvr.view.tiles import batch_size, batches, tile
 from jaxvr.volume import packing
 from jaxvr.volume.connectivity import FACES
@@ -37,25 +38,25 @@ def _tiles(camera: jaxvr.Camera) -> Any:
 
 
 def _selected(scene: Any, rays: Any, sort: Any) -> Any:
-    stream = streams.start_stream(scene, SIZE)
-    held = lax.stop_gradient((scene, rays))
-    return stream._replace(selection=streams._select(sort)(stream.selection, *held))
+    scene, rays = lax.stop_gradient((scene, rays))
+    return next_selection(start_selection(scene), scene, streams.beam(rays), sort)
 
 
 def _select(scene: Any, rays: Any, sort: Any) -> Any:
-    return _selected(scene, rays, sort).selection.count
+    return _selected(scene, rays, sort).count
 
 
 def _sort_only(scene: Any, count: Any) -> Any:
     """Sorts lists as long as those of the tiles, in no order before."""
-    size = streams.start_stream(scene, SIZE).selection.faces.shape[0]
+    size = start_selection(scene).faces.shape[0]
     number = jnp.arange(size, dtype=jnp.int32)
     faces = jnp.stack([(number * jnp.int32(40503)) % 65521, number], 1)
-    return streams._sort_first(faces, count)[0, 0]
+    return sort_first(faces, count)[0, 0]
 
 
 def _cover(scene: Any, rays: Any, sort: Any) -> Any:
-    stream = _selected(scene, rays, sort)
+    stream = streams.start_stream(scene, SIZE)
+    stream = stream._replace(selection=_selected(scene, rays, sort))
 
     def going(stream):
         return ~streams.over(stream)
@@ -82,7 +83,7 @@ def _entries(caster: jaxvr.RayCast, scene: Any, rays: Any) -> Any:
 
 def run(volume: jaxvr.TetMesh, name: str, size: int, k: int, repeat: int) -> list[dict[str, Any]]:
     camera, transfer = viewpoints(volume, size)[-1], transfer_of(volume)
-    tracer, sort = jaxvr.KBuffer(k=k), streams.Sort(jaxvr.order.Centroid())
+    tracer, sort = jaxvr.KBuffer(k=k), Sort(jaxvr.order.Centroid())
     scene, rays = jax.jit(tracer.prepare)(volume), _tiles(camera)
     rays = jax.jit(jax.vmap(partial(tracer.prepare_rays, scene)))(*rays)
 

@@ -114,7 +114,7 @@ def derivative(
 
 
 def compare(found, same_integrator, exact, entry):
-    """All adjoints agree with another one, and all integrators with `Analytic`, as far as they say."""
+    """All adjoints agree with one another, and integrators with `Analytic`, as far as they say."""
     image, slopes = found
     assert np.isfinite(image).all() and image[..., 3].max() > 0.3
     assert np.allclose(image, same_integrator[0], atol=1e-12)

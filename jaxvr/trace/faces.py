@@ -14,7 +14,7 @@ from jax import lax
 from jaxvr._core.gather import take
 from jaxvr._core.pytree import pytree
 from jaxvr.trace.scene import Scene, coordinates_of, entry_corners
-from jaxvr.trace.stream import BLOCK
+from jaxvr.trace.select import BLOCK
 from jaxvr.volume import packing
 
 Array = jax.Array

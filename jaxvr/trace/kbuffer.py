@@ -52,10 +52,10 @@ from jaxvr.trace.local import (
     segment_between,
 )
 from jaxvr.trace.scene import Scene, entry_corners, longest_edge, make_scene, values_at
+from jaxvr.trace.select import Sort
 from jaxvr.trace.stream import (
     BeamRays,
     Hits,
-    Sort,
     Stream,
     beam_rays,
     drawn,

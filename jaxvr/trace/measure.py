@@ -21,7 +21,8 @@ from jaxvr._core.checks import is_concrete
 from jaxvr.order import AbstractOrder, Centroid
 from jaxvr.trace.faces import CellFaces, cell_faces
 from jaxvr.trace.scene import make_scene
-from jaxvr.trace.stream import Sort, beam_rays, draw, tolerance
+from jaxvr.trace.select import Sort
+from jaxvr.trace.stream import beam_rays, draw, tolerance
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size, batches, tile, untile
 from jaxvr.volume.mesh import TetMesh

@@ -23,8 +23,9 @@ from jaxvr._core.pytree import pytree, static
 from jaxvr.order import AbstractOrder, Centroid
 from jaxvr.trace.face import crossing, opposite_edges, sizes_of
 from jaxvr.trace.scene import coordinates_of, scale_of
+from jaxvr.trace.select import BLOCK, Sort
 from jaxvr.trace.shear import shear_rays
-from jaxvr.trace.stream import BLOCK, Hits, Sort, beam_rays, draw, face_at
+from jaxvr.trace.stream import Hits, beam_rays, draw, face_at
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size, batches, tile_order
 

@@ -12,7 +12,6 @@ import jaxvr
 from experiments.memory import reserved
 from jaxvr.volume import datasets
 
-
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
 

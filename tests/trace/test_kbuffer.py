@@ -10,7 +10,7 @@ import pytest
 
 import jaxvr
 from jaxvr._core import status as bits
-from jaxvr.trace import stream
+from jaxvr.trace import cover, select
 from jaxvr.volume import datasets
 
 pytestmark = pytest.mark.usefixtures("quick_code")
@@ -120,12 +120,12 @@ def test_faces_are_selected_in_bounded_lists(monkeypatch):
     camera = jaxvr.Camera.orbit(mesh, 20, 30, width=8, height=8)
     tf = jaxvr.TransferFunction([0.0, 1.0], np.eye(3)[:2], [1.0, 2.0], dtype="float32")
     exact = jaxvr.render(mesh, camera, tf)
-    monkeypatch.setattr(stream, "LIST", 2 * stream.LOOK * stream.BLOCK)
-    monkeypatch.setattr(stream, "BITS", 1)
+    monkeypatch.setattr(select, "LIST", 2 * select.LOOK * select.BLOCK)
+    monkeypatch.setattr(cover, "BITS", 1)
     tracer = jaxvr.KBuffer(k=ENOUGH + 1)  # one that no other test has compiled
     state = jax.eval_shape(lambda: _start(tracer, mesh, camera))
     assert state.stream.selection.faces.shape == (2048, 2)
-    assert state.stream.masks.shape[0] == 1
+    assert state.stream.cover.masks.shape[0] == 1
     assert mesh.n_tets * 2 > 1024  # a list holds less than all faces
     assert np.allclose(jaxvr.render(mesh, camera, tf, tracer=tracer), exact, atol=1e-6)
 
