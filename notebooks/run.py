@@ -35,8 +35,8 @@ def smaller(code: str) -> str:
 
 def run(path: Path) -> list[float]:
     """Runs a notebook and writes it back; the seconds of each cell."""
-    import nbformat
-    from nbclient import NotebookClient
+    import nbformat  # pyright: ignore[reportMissingImports]
+    from nbclient import NotebookClient  # pyright: ignore[reportMissingImports]
 
     book = nbformat.read(path, as_version=4)
     seconds: list[float] = []

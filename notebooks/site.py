@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import re
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +77,37 @@ def collect(out: Path) -> None:
             lines += [f"::: {name}", ""]
         file = reference / f"{page.lower().replace(' ', '_')}.md"
         file.write_text("\n".join(lines))
+
+
+# One or more names, perhaps with a shape and a dtype, and a colon.
+_SHAPE = r"(?: \([^()]*\))?(?: [a-z]+\d+)?"
+
+
+def listed(text: str, names: Iterable[str]) -> str:
+    """A docstring with an entry of a list for each description of one of the names.
+
+    Classes and functions here describe fields and arguments in running text, `name: what it is.
+    next (N, 3): ...`, which is short to read in an editor and would run together in Markdown.
+    names: those of the class's or function's own fields or arguments.
+    """
+    name = "|".join(sorted(map(re.escape, names), key=len, reverse=True))
+    if not name:
+        return text
+    one = rf"(?:{name}){_SHAPE}"
+    label = re.compile(rf"(?:(?<=^)|(?<=\n)|(?<=[.;] ))({one}(?:(?:,| and) {one})*): ")
+    return "\n\n".join(_paragraph(x, label) for x in text.split("\n\n"))
+
+
+def _paragraph(text: str, label: re.Pattern[str]) -> str:
+    # Sections ("Raises:"), code and tables are as they are.
+    if re.match(r"[A-Z]\w+:\n|    |```|\||>>> ", text):
+        return text
+    before, *parts = label.split(text)
+    entries = [
+        f"- `{x}`: {' '.join(y.split())}" for x, y in zip(parts[::2], parts[1::2], strict=True)
+    ]
+    head = [before.strip()] if before.strip() else []
+    return "\n\n".join([*head, "\n".join(entries)]) if entries else text
 
 
 def main(arguments: list[str] | None = None) -> None:

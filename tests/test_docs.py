@@ -17,7 +17,7 @@ import pytest
 import jaxvr
 import jaxvr.plot
 from jaxvr import cli
-from notebooks.site import collect, public
+from notebooks.site import collect, listed, public
 
 ROOT = Path(__file__).resolve().parents[1]
 OTHERS = sorted([*ROOT.glob("notebooks/*.md"), *ROOT.glob("experiments/*.md")])
@@ -142,6 +142,14 @@ def require_arguments(dotted, function, text):
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
             assert re.search(rf"\b{name}\b", pages), f"{dotted}: nothing is said of {name!r}"
+
+
+def test_fields_become_lists_on_the_site():
+    text = "What it is: this.\n\nx, y (N, 3): where\nit is. z: how\nhigh.\n\nRaises:\n  z: no."
+    assert listed(text, ["x", "y", "z", "is"]) == (
+        "What it is: this.\n\n- `x, y (N, 3)`: where it is.\n- `z`: how high.\n\nRaises:\n  z: no."
+    )
+    assert listed(text, []) == text
 
 
 def test_the_site_has_all_pages(tmp_path):
