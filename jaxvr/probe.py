@@ -19,9 +19,9 @@ from jax import lax
 from jaxvr._core.checks import is_concrete
 from jaxvr._core.status import check
 from jaxvr.adjoint.base import Operands, Pipeline, advance, begin, busy, shade_piece
+from jaxvr.arguments import camera_of, rays_of, transfer_of, volume_of
 from jaxvr.composite import Over
 from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
-from jaxvr.render import _camera_of, _rays_of, _transfer_of, _volume_of
 from jaxvr.trace import AbstractTracer, RayCast
 from jaxvr.trace.recorded import record
 from jaxvr.view.camera import Camera
@@ -107,16 +107,16 @@ def probe(
     """
     if not is_concrete(*jax.tree.leaves((volume, camera, transfer))):
         raise ValueError("probe cannot run inside jit or grad. Call it outside.")
-    volume, transfer = _volume_of(volume), _transfer_of(transfer, volume)
+    volume, transfer = volume_of(volume), transfer_of(transfer, volume)
     if isinstance(camera, Camera):
-        origins, directions = (np.asarray(x) for x in _camera_of(camera, volume).rays())
+        origins, directions = (np.asarray(x) for x in camera_of(camera, volume).rays())
         if pixels is not None:
             row, column = _pixels_of(pixels, origins.shape[:2])
             origins, directions = origins[row, column], directions[row, column]
     elif pixels is not None:
         raise ValueError("pixels belong to a camera, but rays were given. Pass only those wanted.")
     else:
-        origins, directions = (np.asarray(x) for x in _rays_of(*camera, volume))
+        origins, directions = (np.asarray(x) for x in rays_of(*camera, volume))
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     pipeline = Pipeline(tracer or RayCast(), integrator or Analytic(), Over())

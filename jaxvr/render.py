@@ -22,17 +22,17 @@ from jax import lax
 
 from jaxvr import hints
 from jaxvr import native as compiled
-from jaxvr._core.checks import as_floats, is_concrete, require_finite
+from jaxvr._core.checks import is_concrete
 from jaxvr._core.status import check
 from jaxvr.adjoint import AbstractAdjoint, Pipeline, Replay
 from jaxvr.adjoint.base import Operands
+from jaxvr.arguments import background_of, camera_of, dtype_of, rays_of, transfer_of, volume_of
 from jaxvr.composite import Over
 from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
 from jaxvr.trace import AbstractTracer, RayCast, Recorded, Segments
 from jaxvr.trace.recorded import fill, record
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
-from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
 
@@ -87,11 +87,11 @@ def render(
     `jaxvr.optics.partition` and the adjoints.
     """
     pipeline = _pipeline(tracer or RayCast(), integrator, compositor)
-    camera = _camera_of(camera, _volume_of(volume))
-    transfer = _transfer_of(transfer, volume)
+    camera = camera_of(camera, volume_of(volume))
+    transfer = transfer_of(transfer, volume)
     image, bits, seen = _render(
         *(pipeline, adjoint or Replay(), _batch_size(budget, volume), volume, camera, transfer),
-        _background(background),
+        background_of(background),
     )
     if status:
         return image, bits
@@ -129,11 +129,11 @@ def render_rays(
       directions too.
     """
     pipeline = _pipeline(tracer or RayCast(), integrator, compositor)
-    origins, directions = _rays_of(origins, directions, _volume_of(volume))
-    transfer = _transfer_of(transfer, volume)
+    origins, directions = rays_of(origins, directions, volume_of(volume))
+    transfer = transfer_of(transfer, volume)
     rgba, bits = _render_rays(
         *(pipeline, adjoint or Replay(), _batch_size(budget, volume)),
-        *(volume, origins, directions, transfer, _background(background)),
+        *(volume, origins, directions, transfer, background_of(background)),
     )
     if status:
         return rgba, bits
@@ -168,13 +168,13 @@ def trace(
             "trace cannot run inside jit or grad, since the number of segments decides the shape "
             "of its result. Call it outside and pass its result in, or use render."
         )
-    tracer, volume = tracer or RayCast(), _volume_of(volume)
+    tracer, volume = tracer or RayCast(), volume_of(volume)
     if isinstance(camera, Camera):
-        camera = _camera_of(camera, volume)
+        camera = camera_of(camera, volume)
         shape, order = (camera.height, camera.width), tile_order(camera.height, camera.width)
         origins, directions = (x.reshape(-1, 3)[order] for x in camera.rays())
     else:
-        origins, directions = _rays_of(*camera, volume)
+        origins, directions = rays_of(*camera, volume)
         shape, order = origins.shape[:-1], np.arange(origins.size // 3)
         origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     how = (tracer, compiled.covers(native, volume.dtype, tracer), _batch_size(budget, volume))
@@ -222,9 +222,11 @@ def shade(
       `segments.scalar`, `segments.length` and `background`.
     """
     pipeline = _pipeline(Recorded(), integrator, compositor)
-    transfer = _transfer_of(transfer, segments)
+    transfer = transfer_of(transfer, segments)
     size = _batch_size(budget, segments)
-    return _shade(pipeline, adjoint or Replay(), size, segments, transfer, _background(background))
+    return _shade(
+        pipeline, adjoint or Replay(), size, segments, transfer, background_of(background)
+    )
 
 
 def _pipeline(
@@ -304,7 +306,7 @@ def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):
 
 def _batch_size(budget: Any, volume: Any) -> int:
     """Rays that march at once."""
-    dtype = np.dtype(_dtype_of(volume))
+    dtype = np.dtype(dtype_of(volume))
     if budget is None:
         return batch_size(dtype) if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
     if not isinstance(budget, int | float | np.number) or not 1 <= budget < math.inf:
@@ -317,69 +319,3 @@ def _over(rgba: Array, background: Array | None) -> Array:
         return rgba
     behind = jnp.concatenate([background.astype(rgba.dtype), jnp.ones(1, rgba.dtype)])
     return rgba + (1 - rgba[..., 3:]) * behind.reshape((1,) * (rgba.ndim - 1) + (4,))
-
-
-def _background(background: Any) -> Any:
-    if background is None:
-        return None
-    background = as_floats("background", background, ndim=1)
-    if background.shape != (3,):
-        raise ValueError(f"background must be RGB with shape (3,), but has {background.shape}.")
-    require_finite("background", background)
-    return jnp.asarray(background)
-
-
-def _dtype_of(volume: Any) -> Any:
-    return volume.scalar.dtype if isinstance(volume, Segments) else volume.points.dtype
-
-
-def _cast(tree: Any, dtype: Any) -> Any:
-    return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), tree)
-
-
-def _volume_of(volume: Any) -> TetMesh:
-    if not isinstance(volume, TetMesh):
-        raise ValueError(
-            f"volume must be a jaxvr.TetMesh, but is a {type(volume).__name__}. "
-            "Read files with jaxvr.read_mesh."
-        )
-    return volume
-
-
-def _camera_of(camera: Any, volume: Any) -> Camera:
-    if not isinstance(camera, Camera):
-        raise ValueError(f"camera must be a jaxvr.Camera, but is a {type(camera).__name__}.")
-    for name in ("eye", "target", "up", "fov", "extent"):
-        part = getattr(camera, name)
-        if part is not None:
-            require_finite(f"camera.{name}", part)
-    return _cast(camera, _dtype_of(volume))
-
-
-def _transfer_of(transfer: Any, volume: Any) -> TransferFunction:
-    if not isinstance(transfer, TransferFunction):
-        raise ValueError(
-            f"transfer must be a jaxvr.TransferFunction, but is a {type(transfer).__name__}."
-        )
-    return _cast(transfer, _dtype_of(volume))
-
-
-def _rays_of(origins: Any, directions: Any, volume: Any) -> tuple[Array, Array]:
-    dtype = _dtype_of(volume)
-    origins, directions = as_floats("origins", origins), as_floats("directions", directions)
-    for name, x in (("origins", origins), ("directions", directions)):
-        if x.ndim == 0 or x.shape[-1] != 3:
-            raise ValueError(f"{name} must have shape (..., 3), but has {x.shape}.")
-        require_finite(name, x)
-    shape = np.broadcast_shapes(origins.shape, directions.shape)
-    if 0 in shape:
-        raise ValueError(f"There are no rays: their shape is {shape}.")
-    if is_concrete(directions):
-        none = ~np.asarray(directions).any(-1)
-        if none.any():
-            first = tuple(int(i) for i in np.argwhere(none)[0])
-            raise ValueError(f"{int(none.sum())} direction(s) are zero, the first at {first}.")
-    origins, directions = (
-        jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in (origins, directions)
-    )
-    return origins, directions

@@ -302,7 +302,7 @@ def test_a_gradient_by_a_transfer_function_has_its_bars_and_lines():
         np.testing.assert_allclose(line.get_xdata(), JUMP.positions)
     for axes in (ax, right):
         assert axes.get_ylim()[0] == -axes.get_ylim()[1]  # both are 0 at the same height
-    with pytest.raises(ValueError, match=r"gradient.extinctions must have shape \(1\)"):
+    with pytest.raises(ValueError, match=r"gradient.extinctions must have shape \(1,\)"):
         plot.transfer_gradient(NOTHING, SLOPE)
 
 

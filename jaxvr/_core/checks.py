@@ -62,6 +62,13 @@ def as_floats(name: str, x: Any, *, ndim: int | None = None, dtype: Any = None) 
     return x.astype(float_dtype(x.dtype) if dtype is None else dtype)
 
 
+def require_kind(name: str, x: Any, kind: type, hint: str = "") -> None:
+    """ValueError unless `x` is an instance of this public class."""
+    if not isinstance(x, kind):
+        what = f"{name} must be a jaxvr.{kind.__name__}, but is a {type(x).__name__}."
+        raise ValueError(f"{what} {hint}".rstrip())
+
+
 def require_finite(name: str, x: Any) -> None:
     """ValueError with the count and the first index of NaN or infinite entries (if concrete)."""
     if not is_concrete(x):
@@ -82,5 +89,6 @@ def require_shape(name: str, x: Any, shape: tuple[int | None, ...]) -> None:
         s is None or s == n for s, n in zip(shape, x.shape, strict=True)
     )
     if not ok:
-        want = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
+        want = ", ".join("any" if s is None else str(s) for s in shape)
+        want = f"({want},)" if len(shape) == 1 else f"({want})"
         raise ValueError(f"{name} must have shape {want}, but has {x.shape}.")

@@ -19,9 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxvr._core.checks import as_floats, require_finite, require_shape
+from jaxvr._core.checks import require_kind
 from jaxvr._core.status import check
 from jaxvr.adjoint import AbstractAdjoint
+from jaxvr.arguments import background_of
 from jaxvr.composite import Over
 from jaxvr.fit.batches import Batch, Views, deal, gather_views, listed, make_batches, pictures_of
 from jaxvr.fit.loop import Control, batch_number, run
@@ -107,12 +108,9 @@ def fit(
       ValueError: for arguments that do not fit each other. FitError: if the loss becomes NaN or
         infinite. RenderError: if a ray could not be followed.
     """
-    if not isinstance(transfer, TransferFunction):
-        raise ValueError(
-            f"transfer must be a jaxvr.TransferFunction, but is a {type(transfer).__name__}."
-        )
+    require_kind("transfer", transfer, TransferFunction)
     begin = time.perf_counter()
-    background = _background(background)
+    background = background_of(background)
     cameras, targets = listed(cameras), pictures_of(targets)
     number_seen = len(cameras)
     if len(targets) != number_seen:
@@ -269,15 +267,6 @@ def _value(
 @functools.partial(jax.jit, static_argnums=0)
 def _gradient(objective: Objective, raw: Any, *rest: Any) -> Any:
     return jax.value_and_grad(_value, has_aux=True)(raw, objective, *rest)
-
-
-def _background(background: Any) -> Array | None:
-    if background is None:
-        return None
-    background = as_floats("background", background)
-    require_shape("background", background, (3,))
-    require_finite("background", background)
-    return jnp.asarray(background)
 
 
 def _pair(held_out: Any) -> tuple[Any, Any]:

@@ -16,8 +16,9 @@ import numpy as np
 
 from jaxvr._core import svg
 from jaxvr._core.brief import is_known
-from jaxvr._core.checks import as_floats, require_finite, require_shape
+from jaxvr._core.checks import require_kind
 from jaxvr._core.status import check
+from jaxvr.arguments import background_of
 from jaxvr.defaults import default_transfer, diagonal
 from jaxvr.interact import edits as _edits
 from jaxvr.interact.orbit import Orbit
@@ -62,18 +63,13 @@ class Viewer:
         integrator: AbstractIntegrator | None = None,
         background: Any = (1.0, 1.0, 1.0),
     ):
-        if not isinstance(volume, TetMesh):
-            raise ValueError(f"volume must be a jaxvr.TetMesh, but is a {type(volume).__name__}.")
-        if camera is not None and not isinstance(camera, Camera):
-            raise ValueError(f"camera must be a jaxvr.Camera, but is a {type(camera).__name__}.")
+        require_kind("volume", volume, TetMesh)
+        if camera is not None:
+            require_kind("camera", camera, Camera)
         if coarse is not None and (not isinstance(coarse, int) or coarse < 1):
             raise ValueError(f"coarse must be pixels of a side, at least 1, but is {coarse!r}.")
-        if background is not None:
-            background = np.asarray(as_floats("background", background))
-            require_shape("background", background, (3,))
-            require_finite("background", background)
         self.volume, self.tracer, self.integrator = volume, tracer, integrator
-        self.background = background
+        self.background = background_of(background)
         values = np.asarray(volume.values)
         self.range = float(values.min()), float(values.max())
         camera = camera or Camera.orbit(volume, width=size, height=size)
@@ -271,10 +267,7 @@ def _how(divisor: float, segments: Segments | None, transfer: TransferFunction) 
 
 
 def _transfer_of(transfer: Any) -> TransferFunction:
-    if not isinstance(transfer, TransferFunction):
-        raise ValueError(
-            f"transfer must be a jaxvr.TransferFunction, but is a {type(transfer).__name__}."
-        )
+    require_kind("transfer", transfer, TransferFunction)
     if not is_known(transfer.positions, transfer.colors, transfer.extinctions):
         raise ValueError("transfer must have known numbers: explore it outside jit and grad.")
     return transfer

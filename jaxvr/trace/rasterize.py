@@ -17,7 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxvr._core.checks import as_floats, common_float, is_concrete, require_finite, require_shape
+from jaxvr._core.checks import (
+    as_floats,
+    common_float,
+    is_concrete,
+    require_finite,
+    require_kind,
+    require_shape,
+)
 from jaxvr._core.gather import take
 from jaxvr._core.pytree import pytree, static
 from jaxvr.order import AbstractOrder, Centroid
@@ -110,8 +117,7 @@ def rasterize(
             "rasterize cannot run inside jit or grad, since the number of fragments decides the "
             "shape of its result. Call it outside, and Fragments.locate inside."
         )
-    if not isinstance(camera, Camera):
-        raise ValueError(f"camera must be a jaxvr.Camera, but is a {type(camera).__name__}.")
+    require_kind("camera", camera, Camera)
     dtype = common_float(None, *(np.asarray(x) for x in (points, values) if x is not None))
     points = as_floats("points", points, ndim=2, dtype=dtype)
     require_shape("points", points, (None, 3))

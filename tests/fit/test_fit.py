@@ -202,7 +202,7 @@ def test_bad_operands(scene, change, message):
         ({"rays": 5, "views": 1}, "not both"),
         ({"rays": -5}, "rays must be"),
         ({"held_out": 3}, "held_out must be"),
-        ({"background": [1, 2]}, "background must have shape"),
+        ({"background": [1, 2]}, "background must be RGB with shape"),
         ({"cache": False}, "some of the cameras are Segments"),
         ({"iterations": 0}, "iterations must be"),
     ],

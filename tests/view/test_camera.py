@@ -175,7 +175,7 @@ def test_replace_checks_and_switches_kind():
         (dict(eye=(0, 0, 0)), "same point"),
         (dict(up=(0, 0, -2)), "parallel"),
         (dict(up=(0, 0, 0)), "zero vector"),
-        (dict(up=(0, 1)), r"up must have shape \(3\)|up must have shape \(3,?\)"),
+        (dict(up=(0, 1)), r"up must have shape \(3,\)"),
         (dict(eye="here"), "eye must hold numbers"),
         (dict(eye=[[0, 0], [0]]), "eye"),
         (dict(fov=0), "fov must lie between 0 and 180 degrees, but is 0"),

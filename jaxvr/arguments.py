@@ -1,0 +1,81 @@
+"""What verbs are given, checked and in the volume's dtype: the same words for the same mistake.
+
+Each raises a `ValueError` that says what was found.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvr._core.checks import as_floats, is_concrete, require_finite, require_kind
+from jaxvr.optics import TransferFunction
+from jaxvr.trace import Segments
+from jaxvr.view.camera import Camera
+from jaxvr.volume.mesh import TetMesh
+
+Array = jax.Array
+
+
+def background_of(background: Any) -> Array | None:
+    """RGB (3,), or None."""
+    if background is None:
+        return None
+    background = as_floats("background", background)
+    if background.shape != (3,):
+        raise ValueError(f"background must be RGB with shape (3,), but has {background.shape}.")
+    require_finite("background", background)
+    return jnp.asarray(background)
+
+
+def dtype_of(volume: Any) -> Any:
+    """Of a mesh or of segments."""
+    return volume.scalar.dtype if isinstance(volume, Segments) else volume.points.dtype
+
+
+def _cast(tree: Any, dtype: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), tree)
+
+
+def volume_of(volume: Any) -> TetMesh:
+    require_kind("volume", volume, TetMesh, "Read files with jaxvr.read_mesh.")
+    return volume
+
+
+def camera_of(camera: Any, volume: Any) -> Camera:
+    require_kind("camera", camera, Camera)
+    for name in ("eye", "target", "up", "fov", "extent"):
+        part = getattr(camera, name)
+        if part is not None:
+            require_finite(f"camera.{name}", part)
+    return _cast(camera, dtype_of(volume))
+
+
+def transfer_of(transfer: Any, volume: Any) -> TransferFunction:
+    require_kind("transfer", transfer, TransferFunction)
+    return _cast(transfer, dtype_of(volume))
+
+
+def rays_of(origins: Any, directions: Any, volume: Any) -> tuple[Array, Array]:
+    """Origins and directions of one shape (..., 3), the latter not zero."""
+    dtype = dtype_of(volume)
+    origins, directions = as_floats("origins", origins), as_floats("directions", directions)
+    for name, x in (("origins", origins), ("directions", directions)):
+        if x.ndim == 0 or x.shape[-1] != 3:
+            raise ValueError(f"{name} must have shape (..., 3), but has {x.shape}.")
+        require_finite(name, x)
+    shape = np.broadcast_shapes(origins.shape, directions.shape)
+    if 0 in shape:
+        raise ValueError(f"There are no rays: their shape is {shape}.")
+    if is_concrete(directions):
+        none = ~np.asarray(directions).any(-1)
+        if none.any():
+            first = tuple(int(i) for i in np.argwhere(none)[0])
+            raise ValueError(f"{int(none.sum())} direction(s) are zero, the first at {first}.")
+    origins, directions = (
+        jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in (origins, directions)
+    )
+    return origins, directions
