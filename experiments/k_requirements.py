@@ -47,6 +47,7 @@ def run(
                 *(found.count_above(2), found.count_above(6)),
             )
             row |= {key: max(row[key], int(x)) for key, x in zip(keys, numbers, strict=True)}
+            print(f"{name}, by {label}: {numbers}", flush=True)
             if most is None or found.count_above(6) > most.count_above(6):
                 most = found
         row["seconds a view"] = (time.perf_counter() - start) / views
