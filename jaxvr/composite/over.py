@@ -63,7 +63,9 @@ class Over:
     never ends one before its last segment, and costs nothing. What is left out is bounded, whatever
     lies behind: |rgb - exact| is at most `termination` times the largest colour, and exact alpha -
     alpha is from 0 to `termination`, both to rounding. 1/255 cannot be seen in 8 bits. Rays of a
-    batch go in lock step, so time is saved where all of them end early.
+    batch go in lock step, so time is saved where all of them end early. All that is of segments in
+    order; a `KBuffer` with too small a k skips some, and of a ray that ends early it cannot always
+    tell.
 
     Gradients are those of the image that is rendered, with the cells where rays end held fixed:
     what lies behind them has none. As a function of the parameters that image has steps, of the

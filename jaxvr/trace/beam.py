@@ -49,9 +49,19 @@ class Beam(NamedTuple):
     high: Array
 
 
+def are_rays(origins: Array, directions: Array) -> Array:
+    """Which (R,) of rays (3, R) are any: finite, and with a direction."""
+    finite = jnp.isfinite(origins) & jnp.isfinite(directions)
+    return jnp.all(finite, axis=0) & jnp.any(directions != 0, axis=0)
+
+
 def beam_of(origins: Array, directions: Array) -> Beam:
-    """The beam of rays (3, R) in the scene's units, where coordinates are below 1 in size."""
+    """The beam of rays (3, R) in the scene's units, where coordinates are below 1 in size. What are
+    no rays stand for one that is, so that they do not hide what others meet."""
     origins, directions = lax.stop_gradient((origins, directions))
+    there = are_rays(origins, directions)
+    one = jnp.argmax(there)
+    origins, directions = (jnp.where(there, x, x[:, one, None]) for x in (origins, directions))
     origin, direction = origins[:, :1], directions[:, :1]
     parallel = jnp.all(directions == direction)
     pinhole = jnp.all(origins == origin) & ~parallel

@@ -19,15 +19,20 @@ and where a cell is inverted. And it is known whether every cell that a ray cros
 
 What a k that is too small does. A fragment whose partner has not arrived leaves the buffer without
 one, and the segment is missing. That is seen, and sets the status `K_TOO_SMALL` of the ray, as does
-a fragment that arrives behind its turn. A ray without it has every segment, in order. How many
-entries an image needs is what `measure_k` tells.
+a fragment that arrives behind its turn. A ray that is followed to its end without it has every
+segment, in order. A ray that ends early (`Over(termination=...)`) has those that it has gone by in
+order, and says what was missing until then; not what would have turned out to be missing later,
+since faces behind are no longer drawn for it. How many entries an image needs is what `measure_k`
+tells.
 
-Floats are those of `RayCast`, from the same vertices by the same arithmetic.
+Floats are those of `RayCast`, from the same vertices by the same arithmetic. The two share the
+decision whether a ray meets a face, and differ in how they find faces, and in their order.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -40,6 +45,7 @@ from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment, turned
 from jaxvr.order import AbstractOrder, Centroid
 from jaxvr.trace.base import AbstractTracer
+from jaxvr.trace.beam import are_rays
 from jaxvr.trace.buffer import Entry, choose_pair, crossing_of, forget, on_side, pick, settle
 from jaxvr.trace.face import Crossing, barycentric
 from jaxvr.trace.faces import CellFaces, cell_faces
@@ -76,6 +82,7 @@ class BufferState(NamedTuple):
     buffer: the last entry is the place of the fragment that arrives. count (R,): entries in use.
     outside (R,): the paper's tag of a pixel. reach (R,): depth before which nothing may arrive any
     more. owed: a cell (R,) that lacks a fragment, -1 if none does, and the depth (R,) of its other.
+    wrong (R,): bits of status that stay; the status has what is owed at the time, too.
     ends: words (R,) of the segment's faces, the nearer one first. begun (R,): had a segment.
     """
 
@@ -85,6 +92,7 @@ class BufferState(NamedTuple):
     outside: Array
     reach: Array
     owed: tuple[Array, Array]
+    wrong: Array
     ends: tuple[Array, Array]
     begun: Array
     segment: Segment
@@ -100,7 +108,8 @@ class KBuffer(AbstractTracer):
 
     k: entries. A ray that would have needed more has the status `K_TOO_SMALL`, an error outside
     jit; `render(..., status=True)` gives the image and the status instead, and `measure_k` the k
-    that a view needs. Time grows with it.
+    that a view needs. Time grows with it. Rays that end early, by `Over(termination=...)`, know
+    less: see the module.
     order: a `jaxvr.order.AbstractOrder`; the better it sorts, the smaller k may be.
     pairs: "cells" or "closest", which two fragments make a segment; "closest" is the paper's.
     reverse: the farthest segments first; an `Over` that composites back to front sets it.
@@ -122,8 +131,10 @@ class KBuffer(AbstractTracer):
     reverse: bool = False
 
     def __post_init__(self):
-        if not isinstance(self.k, int) or self.k < 1:
+        number = isinstance(self.k, numbers.Integral) and not isinstance(self.k, bool)
+        if not number or self.k < 1:
             raise ValueError(f"k must be a positive integer, but is {self.k!r}.")
+        object.__setattr__(self, "k", int(self.k))
         if not isinstance(self.order, AbstractOrder):
             raise ValueError(
                 "order must be an order of faces, such as jaxvr.order.Centroid(), but is "
@@ -149,6 +160,9 @@ class KBuffer(AbstractTracer):
         zero, no = jnp.zeros(count, dtype), jnp.zeros(count, bool)
         integer, rows = jnp.zeros(count, jnp.int32), (self.k + 1, count)
         values = 1 if one_value(scene.scene) else 2
+        # Points without a place may be behind any segment that is missing, not a small k.
+        broken = ~jnp.all(jnp.isfinite(jnp.stack(scene.boxes)))
+        wrong = integer + jnp.where(broken, bits.LOST, 0).astype(jnp.int32)
         return BufferState(
             stream=start_stream(scene, count),
             buffer=Entry(
@@ -160,13 +174,14 @@ class KBuffer(AbstractTracer):
             outside=no,
             reach=zero - jnp.inf,
             owed=(integer - 1, zero),
+            wrong=wrong,
             ends=(integer, integer),
             begun=no,
             segment=Segment(zero, zero, zero),
             active=no,
-            waiting=~no,
+            waiting=are_rays(rays.origins, rays.directions),
             fresh=no,
-            status=integer,
+            status=wrong,
         )
 
     def step(self, scene: CellFaces, rays: BeamRays, state: BufferState, move: Array):
@@ -244,15 +259,16 @@ def _values(scene: Scene, words: Array, new: Hits, wanted: Array) -> Array:
 def _arrive(rays: BeamRays, state: BufferState, hit: Array, new: Entry, how: KBuffer):
     """Fragments (R,) that were hit take the last entry."""
     depth = lax.stop_gradient(new.depth[0])
-    seen = depth <= 0 if how.reverse else depth >= 0
+    # The order behind the eye matters only where each fragment leads inside or outside.
+    seen = (depth <= 0 if how.reverse else depth >= 0) | (how.pairs == "closest")
     late = hit & seen & (depth < state.reach - tolerance(depth, rays.sheared))
     buffer = jax.tree.map(
         lambda rows, x: rows.at[..., -1, :].set(jnp.where(hit, x, rows[..., -1, :])),
         state.buffer,
         new,
     )
-    status = state.status | jnp.where(late, bits.K_TOO_SMALL, 0).astype(jnp.int32)
-    return state._replace(buffer=buffer, count=state.count + hit.astype(jnp.int32), status=status)
+    wrong = state.wrong | jnp.where(late, bits.K_TOO_SMALL, 0).astype(jnp.int32)
+    return state._replace(buffer=buffer, count=state.count + hit.astype(jnp.int32), wrong=wrong)
 
 
 def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuffer):
@@ -291,7 +307,8 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
     count = count - drop.astype(jnp.int32)
     state = _account(rays, state, first, second, left, drop, how)
     finished = done & (count == 0)
-    owing = finished & (state.owed[0] >= 0)
+    # A ray may end here, so what is owed now is told; it is taken back if it turns out to be paid.
+    owing = jnp.where(state.owed[0] >= 0, bits.K_TOO_SMALL, 0).astype(jnp.int32)
 
     # A ray without a segment stands at the end of its last.
     active = jnp.where(go, given, state.active)
@@ -308,7 +325,7 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
         active=active,
         waiting=jnp.where(go, ~given & ~finished, state.waiting),
         fresh=given & (~state.begun | (segment.front != back)),
-        status=state.status | jnp.where(owing, bits.K_TOO_SMALL, 0).astype(jnp.int32),
+        status=jnp.where(go, state.wrong | owing, state.status),
     )
 
 
@@ -322,8 +339,7 @@ def _account(rays: BeamRays, state: BufferState, first, second, left: Array, dro
     depth = lax.stop_gradient(first.depth[0])
     if how.pairs == "closest":
         reach = lax.stop_gradient(second.depth[0])
-        reach = jnp.where(drop & (reach > state.reach), reach, state.reach)
-        return state._replace(reach=reach)
+        return state._replace(reach=jnp.where(drop, jnp.maximum(state.reach, reach), state.reach))
     seen = drop & (depth <= 0 if how.reverse else depth >= 0)
     cell = packing.cell_of(jnp.max(left, axis=0))
     both = seen & jnp.all(left >= 0, axis=0)
@@ -335,6 +351,6 @@ def _account(rays: BeamRays, state: BufferState, first, second, left: Array, dro
     missing = both | apart | another
     owed = jnp.where(paid, -1, jnp.where(cell >= 0, cell, owed))
     where = jnp.where(cell >= 0, depth, where)
-    status = state.status | jnp.where(missing, bits.K_TOO_SMALL, 0).astype(jnp.int32)
-    reach = jnp.where(drop, depth, state.reach)
-    return state._replace(owed=(owed, where), reach=reach, status=status)
+    wrong = state.wrong | jnp.where(missing, bits.K_TOO_SMALL, 0).astype(jnp.int32)
+    reach = jnp.where(drop, jnp.maximum(state.reach, depth), state.reach)
+    return state._replace(owed=(owed, where), reach=reach, wrong=wrong)

@@ -4,6 +4,11 @@ The fragments of a pixel arrive in the order of their faces' keys. How far one h
 number of those before it that are farther (`jaxvr.order.moved`); what a buffer needs follows from
 it (`jaxvr.order.entries_needed`). Only the farthest few fragments so far have to be remembered to
 count: a count that reaches their number is counted again with more of them.
+
+What is behind the eye leaves a buffer before anything in front of it, and is not looked at: neither
+its order nor its number matters. Only the last of it does, which is the other end of the segment
+that starts at the eye. So it stands in for the closest fragment, if there is one. Back to front it
+is different: what is behind the eye arrives among the rest and takes their places, and counts.
 """
 
 from __future__ import annotations
@@ -11,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +44,7 @@ class KMap:
     """What the pixels of a view ask of a k-buffer. All arrays are (height, width) int32 of NumPy.
 
     entries: k that a pixel needs, at least 1. moved: the farthest that a fragment has to move
-    forward. fragments: how many there are.
+    forward. fragments: how many there are, in front of the camera or, back to front, on both sides.
     """
 
     entries: np.ndarray
@@ -48,7 +53,7 @@ class KMap:
 
     @property
     def k(self) -> int:
-        """The smallest k that is enough for all pixels."""
+        """A k that is enough for all pixels; the smallest one, unless the eye is in the mesh."""
         return int(self.entries.max())
 
     def count_above(self, k: int) -> int:
@@ -56,17 +61,26 @@ class KMap:
         return int((self.entries > k).sum())
 
 
-def measure_k(volume: TetMesh, camera: Camera, *, order: AbstractOrder | None = None) -> KMap:
+def measure_k(
+    volume: TetMesh,
+    camera: Camera,
+    *,
+    order: AbstractOrder | None = None,
+    direction: Literal["front to back", "back to front"] = "front to back",
+) -> KMap:
     """The k that `KBuffer` needs for a view, and where.
 
     Args:
       volume: a `TetMesh`. camera: the view. order: as for `KBuffer`; `Centroid()` if None.
+      direction: as for `Over`. The same faces in the opposite order need another k: what comes too
+        late in one comes early in the other, and waits.
 
     Returns:
       a `KMap`. An image with `KBuffer(k=map.k, order=order)` is right everywhere.
 
     Where a mesh is folded or overlaps itself, a fragment may have to stay for a second segment, and
-    an entry more may be needed: the status of the image has the last word.
+    an entry more may be needed: the status of the image has the last word. So it has with
+    `pairs="closest"` and an eye among cells: that way needs what is behind the eye in order, too.
 
     Fragments at the same depth to rounding (a ray through an edge) count as out of order, whichever
     comes first. Not for use inside `jit`: how much there is to remember is only known afterwards.
@@ -78,10 +92,15 @@ def measure_k(volume: TetMesh, camera: Camera, *, order: AbstractOrder | None = 
         )
     if not is_concrete(*jax.tree.leaves((volume, camera))):
         raise ValueError("measure_k cannot run inside jit or grad. Call it outside.")
+    if direction not in ("front to back", "back to front"):
+        raise ValueError(
+            f'direction must be "front to back" or "back to front", but is {direction!r}.'
+        )
     camera = jax.tree.map(lambda x: jnp.asarray(x).astype(volume.dtype), camera)
     rays, count = batches(batch_size(volume.dtype), tuple(tile(x) for x in camera.rays()))
     source = _prepare(volume)
-    order, (number, size, _) = order or Centroid(), rays[0].shape
+    sort = Sort(order or Centroid(), reverse=direction == "back to front")
+    number, size, _ = rays[0].shape
     out, all_batches = np.zeros((3, number, size), np.int32), np.arange(number)
 
     def measure(again: np.ndarray, most: int) -> None:
@@ -89,15 +108,15 @@ def measure_k(volume: TetMesh, camera: Camera, *, order: AbstractOrder | None = 
         while len(again):
             # A power of two of batches, so that few functions are compiled.
             some = np.resize(again, 1 << (len(again) - 1).bit_length())
-            found = np.stack(_measure(order, most, source, *(x[some] for x in rays)))
+            found = np.stack(_measure(sort, most, source, *(x[some] for x in rays)))
             out[:, again] = found[:, : len(again)]
-            again = again[out[1, again].max(axis=1) >= most]
+            again = again[out[0, again].max(axis=1) >= most]
             most *= 4
 
     # Some batches tell how far to count for most of the others, which then are drawn only once.
     some, rest = all_batches[::FEW], np.delete(all_batches, np.s_[::FEW])
     measure(some, LEAST)
-    usual = np.quantile(out[1, some].max(axis=1), 0.75)
+    usual = np.quantile(out[0, some].max(axis=1), 0.75)
     measure(rest, LEAST * 4 ** max(0, math.ceil(math.log((usual + 1) / LEAST, 4))))
     flat = out.reshape(3, -1, 1)[:, :count]
     return KMap(*(np.asarray(untile(x, camera.height, camera.width))[..., 0] for x in flat))
@@ -105,11 +124,13 @@ def measure_k(volume: TetMesh, camera: Camera, *, order: AbstractOrder | None = 
 
 class _Counts(NamedTuple):
     """farthest (M, R): depths of the M farthest fragments so far, in order. first (R,): depth of
-    the closest, and how far it moved. rest (R,): the same of all others. fragments (R,)."""
+    the closest, and how far it moved. rest (R,): the same of all others. behind (R,): the same of
+    the last fragment behind the eye, -infinity if none is. fragments (R,)."""
 
     farthest: Array
     first: tuple[Array, Array]
     rest: Array
+    behind: tuple[Array, Array]
     fragments: Array
 
 
@@ -119,33 +140,39 @@ def _prepare(volume: TetMesh) -> CellFaces:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _measure(
-    order: AbstractOrder, most: int, source: CellFaces, origins: Array, directions: Array
-) -> Any:
+def _measure(sort: Sort, most: int, source: CellFaces, origins: Array, directions: Array) -> Any:
     """entries, moved and fragments of batches of rays (batches, R), counted up to `most`."""
     size, dtype = origins.shape[1], origins.dtype
 
     def one(inputs):
         origins, directions = inputs
         rays = beam_rays(origins, directions, source.scene.scale)
-        integer = jnp.zeros(size, jnp.int32)
-        far = jnp.full(size, jnp.inf, dtype)
-        nothing = _Counts(jnp.full((most, size), -jnp.inf, dtype), (far, integer), integer, integer)
+        zero, far = jnp.zeros(size, jnp.int32), jnp.full(size, jnp.inf, dtype)
+        nothing = _Counts(
+            -jnp.broadcast_to(far, (most, size)), (far, zero), zero, (-far, zero), zero
+        )
 
         def add(counts, new):
             # Depths are compared without what rounding may do to them.
-            return _count(counts, new.hit, new.at.z, tolerance(new.at.z, rays.sheared))
+            slack, depth = tolerance(new.at.z, rays.sheared), new.at.z
+            seen = new.hit & (sort.reverse | (depth >= 0))
+            return _count(counts, new.hit, seen, -depth if sort.reverse else depth, slack)
 
-        counts = draw(source, rays, Sort(order), nothing, add)
-        first = counts.first[1]
-        entries = jnp.maximum(jnp.maximum(counts.rest + 1, first), 1)
-        return entries, jnp.maximum(counts.rest, first), counts.fragments
+        counts = draw(source, rays, sort, nothing, add)
+        (_, first), (behind, of_behind), rest = counts.first, counts.behind, counts.rest
+        moved = jnp.maximum(rest, first)
+        # Of all fragments that count, the closest needs one entry less.
+        alone = jnp.maximum(rest + 1, first)
+        after = jnp.maximum(moved + 1, of_behind)
+        entries = jnp.where(jnp.isfinite(behind) & (counts.fragments > 0), after, alone)
+        return jnp.maximum(entries, 1), moved, counts.fragments
 
     return lax.map(one, (origins, directions))
 
 
-def _count(counts: _Counts, hit: Array, depth: Array, slack: Array) -> _Counts:
-    farthest, (first, of_first), rest, fragments = counts
+def _count(counts: _Counts, hit: Array, seen: Array, depth: Array, slack: Array) -> _Counts:
+    """counts with one more fragment of rays that `hit` one (R,), which is `seen` (R,) or not."""
+    farthest, (first, of_first), rest, (behind, of_behind), fragments = counts
     moved = jnp.sum(farthest > (depth - slack)[None], axis=0, dtype=jnp.int32)
     # Insertion into a sorted list without a search: what is nearer moves down by one.
     below = jnp.concatenate([jnp.full_like(farthest[:1], jnp.inf), farthest[:-1]])
@@ -153,12 +180,11 @@ def _count(counts: _Counts, hit: Array, depth: Array, slack: Array) -> _Counts:
     farthest = jnp.maximum(farthest, jnp.minimum(below, new[None]))
     closer = depth < first
     others = jnp.where(closer, of_first, moved)
+    last = hit & ~seen & (depth > behind)
     return _Counts(
         farthest,
-        (
-            jnp.where(hit & closer, depth, first),
-            jnp.where(hit & closer, moved, of_first),
-        ),
-        jnp.where(hit & (jnp.isfinite(first) | ~closer), jnp.maximum(rest, others), rest),
-        fragments + hit.astype(jnp.int32),
+        (jnp.where(seen & closer, depth, first), jnp.where(seen & closer, moved, of_first)),
+        jnp.where(seen & (jnp.isfinite(first) | ~closer), jnp.maximum(rest, others), rest),
+        (jnp.where(last, depth, behind), jnp.where(last, moved, of_behind)),
+        fragments + seen.astype(jnp.int32),
     )

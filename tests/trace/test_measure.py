@@ -34,15 +34,18 @@ def fragments(mesh, camera):
     return np.where(met, depth, np.inf), key
 
 
+@pytest.mark.parametrize("direction", ["front to back", "back to front"])
 @pytest.mark.parametrize("mesh", ["box", "squeezed"])
-def test_entries_as_counted_by_hand(mesh):
+def test_entries_as_counted_by_hand(mesh, direction):
     volume = datasets.box((3, 3, 3), jitter=0.3, seed=3, dtype="float64", shuffle=True)
     if mesh == "squeezed":  # long cells: far out of order
         volume = volume.replace(points=np.asarray(volume.points) * [1, 1, 0.02])
     camera = jaxvr.Camera.orbit(volume, 25, 15, width=9, height=7, dtype="float64")
     depths, keys = fragments(volume, camera)
     stream = depths[:, np.argsort(keys)]
-    found = jaxvr.measure_k(volume, camera)
+    if direction == "back to front":
+        stream = np.where(np.isinf(stream), np.inf, -stream)[:, ::-1]
+    found = jaxvr.measure_k(volume, camera, direction=direction)  # type: ignore[arg-type]
     shape = (camera.height, camera.width)
     assert np.array_equal(found.fragments, np.isfinite(stream).sum(1).reshape(shape))
     assert np.array_equal(found.moved, np.max(moved(stream), axis=1).reshape(shape))
@@ -54,3 +57,6 @@ def test_entries_as_counted_by_hand(mesh):
 def test_not_a_mesh():
     with pytest.raises(ValueError, match="takes a TetMesh and a Camera"):
         jaxvr.measure_k(datasets.box((1, 1, 1)), "camera")  # type: ignore[arg-type]
+    camera = jaxvr.Camera.orbit(datasets.box((1, 1, 1)), width=2, height=2)
+    with pytest.raises(ValueError, match="direction must be"):
+        jaxvr.measure_k(datasets.box((1, 1, 1)), camera, direction="up")  # type: ignore[arg-type]
