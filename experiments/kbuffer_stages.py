@@ -131,8 +131,9 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, k: int, repeat: int) -> lis
     ]
     for key in ("render", "entries by hierarchy", "entries by rasteriser"):
         rows.append({"mesh": name, "stage": key, "seconds": t[key], "share": None})
+    rows.append({"mesh": name, "stage": "fragments", "number": hits})
     print(f"{name}: {hits} fragments")
-    print(table(rows), flush=True)
+    print(table(rows[:-1]), flush=True)
     return rows
 
 

@@ -85,7 +85,17 @@ class Fragments:
     def locate(self, points: Any, values: Any, camera: Camera) -> tuple[Array, Array]:
         """depth (N,) and scalar (N,) anew, with fragments held fixed: differentiable in points
         (P, 3), values (P,) and the camera, in both modes. Rays that lie in a triangle's plane have
-        no derivative across it."""
+        no derivative across it.
+
+        Raises:
+          ValueError: if the camera's image has another size.
+        """
+        size = (camera.height, camera.width)
+        if size != (self.height, self.width):
+            raise ValueError(
+                f"The fragments are of an image of {self.height} x {self.width} pixels, but the "
+                f"camera's has {size[0]} x {size[1]}."
+            )
         return _locate(self, jnp.asarray(points), jnp.asarray(values), camera)
 
 
@@ -106,11 +116,16 @@ def rasterize(
 
     Returns:
       `Fragments`, in front of the camera only, in the widest float type of points and values.
-      Memory while drawing is bounded by tiles of the image, about 8 MB; a fragment is 16 bytes.
+      Memory while drawing is bounded by tiles of the image, about 8 MB, beside the fragments:
+      three or four times their own 16 bytes each (24 in float64) until they are sorted.
 
     Raises:
       ValueError: for wrong shapes, indices out of range, a triangle with a point twice, NaN or
-        infinite numbers. Not for use inside `jit`: how many there are decides the result's shape.
+        infinite numbers, 2^31 fragments or more. Not for use inside `jit`: how many there are
+        decides the result's shape.
+
+    Triangles share an edge if they share its two point ids. Where they only have points at the same
+    place, a ray through the edge may meet both or neither: merge such points before.
     """
     if not is_concrete(*jax.tree.leaves((points, triangles, values, camera))):
         raise ValueError(
@@ -136,6 +151,11 @@ def rasterize(
     counts = np.asarray(_count(sort, source, rays))
     start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     total = int(start[-1])
+    if total >= 1 << 31:
+        raise ValueError(
+            f"There are {total} fragments, but at most 2^31 - 1 can be numbered. Draw the image in "
+            "parts, or with fewer pixels."
+        )
     room = max(1 << max(total - 1, 0).bit_length(), 1024)
     faces, depths, scalars = _fill(sort, source, rays, start[:-1].astype(np.int32), room)
     ray = np.repeat(order_of, counts)

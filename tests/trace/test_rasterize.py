@@ -80,6 +80,9 @@ def test_depth_and_scalar_have_derivatives():
     found = jaxvr.rasterize(points, triangles, camera, values)
     assert len(found.face) >= 144
     check_grads(found.locate, (points, values, camera), order=1, eps=1e-6)
+    other = jaxvr.Camera.look_at((5.4, 3.6, 4), (5.5, 3.5, 0), width=12, height=13)
+    with pytest.raises(ValueError, match="an image of 12 x 12 pixels, but the camera's has 13 x"):
+        found.locate(points, values, other)
 
 
 @pytest.mark.parametrize(
