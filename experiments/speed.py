@@ -97,7 +97,8 @@ def fit_iteration(segments: Any, transfer: Any, image: Any) -> Callable[[], Any]
     parameters = Parameters.of(transfer)
     unit = jnp.mean(transfer.extinctions)
     inputs = parameters, unit, None, None, batches[0], np.zeros(2, transfer.dtype)
-    gradient, raw = Objective(l1, None, None, None, None).gradient, parameters.raw()
+    nouns = jaxvr.Analytic(), jaxvr.Over(), jaxvr.Replay(), jaxvr.RayCast()
+    gradient, raw = Objective(l1, *nouns).gradient, parameters.raw()
     once = Control(iterations=1, progress=False)
     return lambda: run(gradient, raw, lambda i: inputs, 1, None, 0.1, once, None, {}).parameters
 

@@ -17,6 +17,8 @@ Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, 
 where they can with the same results.
 """
 
+from typing import TYPE_CHECKING
+
 from jaxvr import native, order
 from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay
@@ -57,7 +59,6 @@ from jaxvr.volume import (
     write_mesh,
 )
 
-# `jaxvr.plot` is not imported here: it needs matplotlib, which takes a while to load.
 __all__ = [
     "Analytic",
     "AverageColor",
@@ -111,3 +112,16 @@ __all__ = [
     "write_mesh",
 ]
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from jaxvr import plot as plot
+else:
+
+    def __getattr__(name):
+        """`jaxvr.plot`, imported where it is first used: it needs matplotlib, which takes a while
+        to load. For the same reason it is not in `__all__`."""
+        if name == "plot":
+            import importlib
+
+            return importlib.import_module("jaxvr.plot")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -11,9 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvr._core.checks import as_floats, is_concrete, require_finite, require_kind
-from jaxvr.optics import TransferFunction
-from jaxvr.trace import Segments
+from jaxvr._core.checks import (
+    as_floats,
+    is_concrete,
+    require_finite,
+    require_kind,
+    require_light,
+)
+from jaxvr.adjoint import AbstractAdjoint, Replay
+from jaxvr.composite import Over
+from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
+from jaxvr.trace import AbstractTracer, RayCast, Segments
 from jaxvr.view.camera import Camera
 from jaxvr.volume.mesh import TetMesh
 
@@ -27,7 +35,7 @@ def background_of(background: Any) -> Array | None:
     background = as_floats("background", background)
     if background.shape != (3,):
         raise ValueError(f"background must be RGB with shape (3,), but has {background.shape}.")
-    require_finite("background", background)
+    require_light("background", background)
     return jnp.asarray(background)
 
 
@@ -57,6 +65,45 @@ def camera_of(camera: Any, volume: Any) -> Camera:
 def transfer_of(transfer: Any, volume: Any) -> TransferFunction:
     require_kind("transfer", transfer, TransferFunction)
     return _cast(transfer, dtype_of(volume))
+
+
+def segments_of(segments: Any) -> Segments:
+    hint = "Make them with jaxvr.trace(volume, camera), or pass the volume to jaxvr.render."
+    require_kind("segments", segments, Segments, hint)
+    return segments
+
+
+def tracer_of(tracer: Any) -> AbstractTracer:
+    return _noun("tracer", tracer, "prepare_rays", RayCast)
+
+
+def integrator_of(integrator: Any) -> AbstractIntegrator:
+    return _noun("integrator", integrator, "slab", Analytic)
+
+
+def compositor_of(compositor: Any) -> Over:
+    return _noun("compositor", compositor, "finish", Over)
+
+
+def adjoint_of(adjoint: Any) -> AbstractAdjoint:
+    return _noun("adjoint", adjoint, "run", Replay)
+
+
+def _noun(name: str, given: Any, method: str, default: type) -> Any:
+    """What was given, or the default if that is None. It is known by a method: a user's own needs
+    no base."""
+    if given is None:
+        return default()
+    if isinstance(given, type) and hasattr(given, method):
+        raise ValueError(
+            f"{name} is the class {given.__name__}, not one of its objects: did you forget the ()?"
+        )
+    if not hasattr(given, method):
+        what = repr(given) if isinstance(given, str) else f"a {type(given).__name__}"
+        raise ValueError(
+            f"{name} must be an object such as jaxvr.{default.__name__}(), but is {what}."
+        )
+    return given
 
 
 def rays_of(origins: Any, directions: Any, volume: Any) -> tuple[Array, Array]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxvr.arguments import volume_of
 from jaxvr.optics import TransferFunction
 from jaxvr.volume import TetMesh
 
@@ -33,9 +34,13 @@ def default_transfer(
 
     Returns:
       a transfer function in the volume's dtype. Of a constant field: one point.
+
+    Raises:
+      ValueError: for what is no `TetMesh`, and for a depth below 0.
     """
     if not 0 <= depth < np.inf:
         raise ValueError(f"depth must be an optical depth of 0 or more, but is {depth!r}.")
+    volume = volume_of(volume)
     low, high = (float(x) for x in (volume.values.min(), volume.values.max()))
     positions = np.linspace(low, high, points) if high > low else np.array([low])
     ramp = np.linspace(0, 1, len(positions)) if high > low else np.ones(1)

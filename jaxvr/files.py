@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from jaxvr._core.checks import as_floats, require_finite
+from jaxvr._core.checks import as_floats, require_finite, require_light
 from jaxvr.render import render
 from jaxvr.view import images as _images
 from jaxvr.view.camera import Camera
@@ -183,7 +183,7 @@ def _floats(image: Any, background: Any) -> np.ndarray:
     _require_image(image)
     require_finite("image", image)
     if image.shape[-1] == 4 and background is not None:
-        require_finite("background", as_floats("background", background))
+        require_light("background", as_floats("background", background))
         image = np.asarray(_images.composite_over(image, background))[..., :3]
     return image
 

@@ -1,15 +1,17 @@
-"""What a strange picture may come from, as warnings that `jaxvr.render` gives.
+"""What a strange picture may come from, as warnings that `jaxvr.render` and `jaxvr.fit` give.
 
 A picture that is empty or of one colour is no error, and it does not say which number is wrong: the
 camera may look away, the field may be in other units than the transfer function, or opacities may
 stand where extinctions per unit of length belong. After a render outside `jit` and `grad` one small
-reduction looks at the largest alpha, the ends of the field and of the transfer function, and
-where the eye stands. Only where one of them is odd is the reason looked for, in NumPy.
+reduction looks at the largest alpha, the ends of the field and of the transfer function, the
+largest extinction, and where the eye stands. Only where one of them is odd is the reason looked
+for, in NumPy. Before a fit cameras and ranges are looked at once.
 """
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -29,10 +31,13 @@ BLANK = 1 / 512
 FAINT = 1 / 50
 # Optical depth over the diagonal of the box below which a faint picture is put down to it.
 THIN = 0.05
-# The part of a range below which another one is taken for one in other units, if it also shows
-# less than this part of what the transfer function has.
-NARROW = 0.01
+# The part of a range below which another one is taken for one in other units (the commonest factor
+# is 100), if it also shows less than this part of what the transfer function has.
+NARROW = 0.03
 ONE_COLOR = 0.05
+# Optical depths of one cell and over the diagonal of the box above which extinctions of less than
+# 1, that is not meant to hide all behind it, are taken for opacities.
+DENSE_CELL, DENSE = 5.0, 100.0
 # An optical depth that shows a volume well: what the advised numbers aim at.
 VISIBLE = 2.0
 
@@ -41,7 +46,8 @@ class ViewWarning(UserWarning):
     """A picture that is probably not the one that was meant, with what it may come from.
 
     `jaxvr.render` warns of a blank picture, of a field and a transfer function whose ranges do not
-    fit each other, and of a camera inside the volume. Where that is meant:
+    fit each other, of opacities in place of extinctions, and of a camera inside the volume;
+    `jaxvr.fit` of ranges, and of cameras that do not see the volume. Where that is meant:
     `warnings.filterwarnings("ignore", category=jaxvr.ViewWarning)`.
     """
 
@@ -54,15 +60,17 @@ def look(
     seen (): the largest alpha of the picture, before its background. stacklevel: as for
     `warnings.warn`, counted from the caller: 1 is the line that calls this.
     """
-    floats = (volume.values, volume.points, camera.eye, camera.target, transfer.positions)
-    others = (camera.up, camera.fov, camera.extent, transfer.colors, transfer.extinctions)
+    floats = (volume.values, volume.points, camera.eye, camera.target)
+    floats = (*floats, transfer.positions, transfer.extinctions)
+    others = (camera.up, camera.fov, camera.extent, transfer.colors)
     if not is_concrete(seen, *floats, *others):
         return
     glance = np.asarray(_glance(camera.extent is not None, seen, *floats))
-    alpha, low, high, first, last, cut = (float(x) for x in glance)
-    apart = high < first or low > last
-    narrow = min(high - low, last - first) < NARROW * max(high - low, last - first)
-    if not (alpha < FAINT or apart or narrow or cut):
+    alpha, low, high, first, last, top, diagonal, cut = (float(x) for x in glance)
+    odd = _odd((low, high), (first, last))
+    # A cheap look at what `_dense` looks at again.
+    dense = top <= 1 and top * diagonal > max(DENSE, DENSE_CELL * volume.n_tets ** (1 / 3))
+    if not (alpha < FAINT or odd or dense or cut):
         return
     if not np.asarray(transfer.extinctions).any():
         return  # nothing is to be seen, and nothing is
@@ -72,17 +80,61 @@ def look(
             warnings.warn(message, ViewWarning, stacklevel=stacklevel + 1)
             return
     for message in (
-        _ranges(volume, transfer, (low, high)) if apart or narrow else None,
+        _ranges(volume, transfer, (low, high)) if odd else None,
+        _dense(volume, transfer, (low, high)) if dense else None,
         _inside(volume, camera) if cut else None,
     ):
         if message:
             warnings.warn(message, ViewWarning, stacklevel=stacklevel + 1)
 
 
+def look_before_fit(
+    volume: TetMesh, cameras: Sequence[Any], transfer: TransferFunction, stacklevel: int
+) -> None:
+    """Warn of cameras that do not see the volume (others than `Camera`s are passed over), and of a
+    start whose control points miss the field. stacklevel: as for `look`."""
+    views = {k: c for k, c in enumerate(cameras) if isinstance(c, Camera)}
+    if not is_concrete(*jax.tree.leaves((volume, list(views.values()), transfer))):
+        return
+    messages = [_unseen(volume, views), _unfit(volume, transfer)]
+    for message in filter(None, messages):
+        warnings.warn(message, ViewWarning, stacklevel=stacklevel + 1)
+
+
+def _unseen(volume: TetMesh, views: dict[int, Camera]) -> str | None:
+    """Which cameras do not see the volume, and why the first of them does not."""
+    points = _used(volume)
+    reasons = {k: _out_of_view(points, camera) for k, camera in views.items()}
+    blind = [k for k, reason in reasons.items() if reason]
+    if not blind:
+        return None
+    return (
+        f"{len(blind)} of {len(views)} cameras do not see the volume, and a fit learns nothing "
+        f"from them. The first is cameras[{blind[0]}]: {reasons[blind[0]]}"
+    )
+
+
+def _unfit(volume: TetMesh, transfer: TransferFunction) -> str | None:
+    """How the control points of a start miss the field. What they hold changes: a ramp over them
+    stands for what they can hold."""
+    ramp = np.linspace(1, 2, len(transfer.positions))
+    ramp = TransferFunction(transfer.positions, np.stack([ramp - 1] * 3, axis=1), ramp)
+    field = float(volume.values.min()), float(volume.values.max())
+    return _ranges(volume, ramp, field) if _odd(field, _ends(ramp)) else None
+
+
+def _odd(field: tuple[float, float], ends: tuple[float, float]) -> bool:
+    """Whether the two ranges may miss each other: apart, or one much narrower."""
+    (low, high), (first, last) = field, ends
+    wide = high - low, last - first
+    return high < first or low > last or min(wide) < NARROW * max(wide)
+
+
 @partial(jax.jit, static_argnums=0)
-def _glance(parallel, seen, values, points, eye, target, positions):
-    """The largest alpha, the ends of the values, the ends of the positions, and whether the eye
-    lies in the box of the points (or the plane of parallel rays cuts it)."""
+def _glance(parallel, seen, values, points, eye, target, positions, extinctions):
+    """The largest alpha, the ends of the values, the ends of the positions, the largest extinction,
+    the diagonal of the box of the points, and whether the eye lies in it (or the plane of parallel
+    rays cuts it)."""
     # Eight points a row, which XLA reduces three times as fast as one.
     rows = jnp.pad(points, ((0, -len(points) % 8), (0, 0)), mode="edge").reshape(-1, 24)
     low = rows.min(axis=0).reshape(8, 3).min(axis=0)
@@ -92,7 +144,8 @@ def _glance(parallel, seen, values, points, eye, target, positions):
         cut = jnp.abs(forward @ middle) < jnp.abs(forward) @ ((high - low) / 2)
     else:
         cut = ((low < eye) & (eye < high)).all()
-    ends = (seen, values.min(), values.max(), positions[0], positions[-1], cut)
+    ends = (seen, values.min(), values.max(), positions[0], positions[-1])
+    ends = (*ends, extinctions.max(), jnp.linalg.norm(high - low), cut)
     return jnp.stack([jnp.asarray(x, points.dtype) for x in ends])
 
 
@@ -207,34 +260,55 @@ def _ranges(volume: TetMesh, transfer: TransferFunction, field: tuple[float, flo
             return None  # the control points crowd where the field is
         part = 100 * (high - low) / (last - first)
         return f"{ranges}, of which the field takes {part:.2g} %: it is of one colour. {advice}"
-    if 0 < last - first < NARROW * (high - low) and numbers[0, 3] > 0 and numbers[-1, 3] > 0:
-        # An end without extinction is a threshold or a peak, narrow on purpose.
+    if 0 < last - first < NARROW * (high - low):
         values = np.asarray(volume.values)
-        part = float(((values >= first) & (values <= last)).mean())
-        if part < NARROW:
+        between = float(((values > first) & (values < last)).mean())
+        beyond = float((values < first).mean()), float((values > last).mean())
+        # Clear where values lie beyond it, it is a threshold or a peak, narrow on purpose.
+        clear = any(beyond[k] > NARROW and numbers[-k, 3] == 0 for k in (0, 1))
+        if between < NARROW and not clear:
             return (
-                f"{ranges}, where {100 * part:.2g} % of the values are: the others have the "
+                f"{ranges}, where {100 * between:.2g} % of the values are: the others have the "
                 f"colours of its two ends. {advice}"
             )
     return None
 
 
+def _dense(volume: TetMesh, transfer: TransferFunction, field: tuple[float, float]) -> str | None:
+    """That opacities may stand for extinctions: what would let light through hides all behind it
+    within one cell."""
+    points = _used(volume)
+    diagonal = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+    shown = _shown(volume, transfer, field)[:, 3]
+    strongest, cell = shown[shown < 1].max(initial=0.0), diagonal / volume.n_tets ** (1 / 3)
+    if strongest * cell < DENSE_CELL or strongest * diagonal < DENSE:
+        return None
+    return (
+        f"One cell hides what is behind it. Extinction is per unit of length: up to "
+        f"{strongest:.3g} over the field's range, and cells are about {cell:.3g} long, which "
+        f"together is an optical depth of {strongest * cell:.2g}. If the numbers are opacities, "
+        f"use TransferFunction.from_opacity(..., unit_distance={_short(diagonal / 10)}); else "
+        f"transfer.scaled({_short(VISIBLE / (strongest * diagonal))}) lets light through."
+    )
+
+
 def _inside(volume: TetMesh, camera: Camera) -> str | None:
-    """That the camera stands in the volume, and what is not seen then."""
+    """That the camera stands in the volume, and what is not seen then. Without the eye's numbers,
+    so that a flight through a volume is warned of once: Python tells equal warnings once."""
     low, high = (np.asarray(x, np.float64) for x in volume.bounds())
     eye, target = (np.asarray(x, np.float64) for x in (camera.eye, camera.target))
     box = f"the volume's box, from {_vector(low)} to {_vector(high)}"
     if camera.extent is None:
         if not ((low < eye) & (eye < high)).all():
             return None  # only points that no cell uses lie around it
-        what = f"The eye {_vector(eye)} lies inside {box}: what is behind it is not seen."
+        what = f"The camera's eye lies inside {box}: what is behind it is not seen."
     else:
         forward = target - eye
         if abs(forward @ ((low + high) / 2 - eye)) >= abs(forward) @ ((high - low) / 2):
             return None
         what = (
-            f"Parallel rays start in the plane through the eye {_vector(eye)}, which cuts {box}: "
-            "what is behind it is not seen."
+            f"Parallel rays start in the plane through the camera's eye, which cuts {box}: what is "
+            "behind it is not seen."
         )
     return f"{what} Move the eye away from the target, or take Camera.orbit(volume)."
 

@@ -19,10 +19,17 @@ from jax import lax
 from jaxvr._core.checks import is_concrete
 from jaxvr._core.status import check
 from jaxvr.adjoint.base import Operands, Pipeline, advance, begin, busy, shade_piece
-from jaxvr.arguments import camera_of, rays_of, transfer_of, volume_of
+from jaxvr.arguments import (
+    camera_of,
+    integrator_of,
+    rays_of,
+    tracer_of,
+    transfer_of,
+    volume_of,
+)
 from jaxvr.composite import Over
-from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
-from jaxvr.trace import AbstractTracer, RayCast
+from jaxvr.optics import AbstractIntegrator, TransferFunction
+from jaxvr.trace import AbstractTracer
 from jaxvr.trace.recorded import record
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size
@@ -119,7 +126,7 @@ def probe(
         origins, directions = (np.asarray(x) for x in rays_of(*camera, volume))
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    pipeline = Pipeline(tracer or RayCast(), integrator or Analytic(), Over())
+    pipeline = Pipeline(tracer_of(tracer), integrator_of(integrator), Over())
     size = min(batch_size(volume.dtype), 1 << max(len(origins) - 1, 0).bit_length())
     parts, counts, status = [], [], []
     scene, table = _prepare(pipeline, volume, transfer)

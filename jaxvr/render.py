@@ -23,13 +23,26 @@ from jax import lax
 from jaxvr import hints
 from jaxvr import native as compiled
 from jaxvr._core.checks import is_concrete
-from jaxvr._core.status import check
-from jaxvr.adjoint import AbstractAdjoint, Pipeline, Replay
+from jaxvr._core.status import LOST, check
+from jaxvr.adjoint import AbstractAdjoint, Pipeline
 from jaxvr.adjoint.base import Operands
-from jaxvr.arguments import background_of, camera_of, dtype_of, rays_of, transfer_of, volume_of
+from jaxvr.arguments import (
+    adjoint_of,
+    background_of,
+    camera_of,
+    compositor_of,
+    dtype_of,
+    integrator_of,
+    rays_of,
+    segments_of,
+    tracer_of,
+    transfer_of,
+    volume_of,
+)
 from jaxvr.composite import Over
-from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
-from jaxvr.trace import AbstractTracer, RayCast, Recorded, Segments
+from jaxvr.optics import AbstractIntegrator, TransferFunction
+from jaxvr.trace import AbstractTracer, Recorded, Segments
+from jaxvr.trace.beam import are_rays
 from jaxvr.trace.recorded import fill, record
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
@@ -80,17 +93,18 @@ def render(
         values only where they are concrete, not inside your own `jit`.
 
     Warns, also only there, with a `jaxvr.ViewWarning` that says what a blank picture comes from, or
-    that the field's range and the transfer function's do not fit, or that the eye is in the volume.
+    that the field's range and the transfer function's do not fit, that the numbers may be opacities
+    instead of extinctions, or that the eye is in the volume.
 
     Differentiable in `volume.values`, `volume.points`, `transfer` (positions, colors, extinctions),
     `camera` (eye, target, up, fov or extent) and `background`. Notes on kinks are with `RayCast`,
     `jaxvr.optics.partition` and the adjoints.
     """
-    pipeline = _pipeline(tracer or RayCast(), integrator, compositor)
+    pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
     camera = camera_of(camera, volume_of(volume))
     transfer = transfer_of(transfer, volume)
     image, bits, seen = _render(
-        *(pipeline, adjoint or Replay(), _batch_size(budget, volume), volume, camera, transfer),
+        *(pipeline, adjoint_of(adjoint), _batch_size(budget, volume), volume, camera, transfer),
         background_of(background),
     )
     if status:
@@ -128,11 +142,11 @@ def render_rays(
       rgba (..., 4), premultiplied linear, in the volume's dtype. Differentiable in origins and
       directions too.
     """
-    pipeline = _pipeline(tracer or RayCast(), integrator, compositor)
+    pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
     origins, directions = rays_of(origins, directions, volume_of(volume))
     transfer = transfer_of(transfer, volume)
     rgba, bits = _render_rays(
-        *(pipeline, adjoint or Replay(), _batch_size(budget, volume)),
+        *(pipeline, adjoint_of(adjoint), _batch_size(budget, volume)),
         *(volume, origins, directions, transfer, background_of(background)),
     )
     if status:
@@ -168,7 +182,7 @@ def trace(
             "trace cannot run inside jit or grad, since the number of segments decides the shape "
             "of its result. Call it outside and pass its result in, or use render."
         )
-    tracer, volume = tracer or RayCast(), volume_of(volume)
+    tracer, volume = tracer_of(tracer), volume_of(volume)
     if isinstance(camera, Camera):
         camera = camera_of(camera, volume)
         shape, order = (camera.height, camera.width), tile_order(camera.height, camera.width)
@@ -221,11 +235,12 @@ def shade(
       image (height, width, 4), or (..., 4) for segments of rays. Differentiable in `transfer`,
       `segments.scalar`, `segments.length` and `background`.
     """
+    segments = segments_of(segments)
     pipeline = _pipeline(Recorded(), integrator, compositor)
     transfer = transfer_of(transfer, segments)
     size = _batch_size(budget, segments)
     return _shade(
-        pipeline, adjoint or Replay(), size, segments, transfer, background_of(background)
+        pipeline, adjoint_of(adjoint), size, segments, transfer, background_of(background)
     )
 
 
@@ -233,7 +248,7 @@ def _pipeline(
     tracer: AbstractTracer, integrator: AbstractIntegrator | None, compositor: Over | None
 ) -> Pipeline:
     """With what the compositor needs: segments from behind, if it goes back to front."""
-    integrator, compositor = integrator or Analytic(), compositor or Over()
+    integrator, compositor = integrator_of(integrator), compositor_of(compositor)
     if compositor.backwards:
         tracer, integrator = tracer.reversed(), integrator.reversed()
     return Pipeline(tracer, integrator, compositor)
@@ -294,7 +309,8 @@ def _run(pipeline, adjoint, size, volume, origins, directions, transfer):
     scene = pipeline.tracer.prepare(volume)
     rays, count = batches(size, (origins, directions))
     rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(*rays)
-    return _finish(pipeline, adjoint, scene, rays, transfer, origins.dtype, count)
+    rgba, status = _finish(pipeline, adjoint, scene, rays, transfer, origins.dtype, count)
+    return rgba, jnp.where(are_rays(origins.T, directions.T), status, status | LOST)
 
 
 def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):

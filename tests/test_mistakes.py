@@ -1,9 +1,10 @@
-"""Eight common mistakes, made as users make them: each is told, with what to do about it."""
+"""Common mistakes, made as users make them: each is told, with what to do about it."""
 
 from __future__ import annotations
 
 import re
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -104,6 +105,25 @@ def test_opacity_instead_of_extinction(mesh):
                                transfer, background=(1.0, 1.0, 1.0))  # fmt: skip
 
 
+def test_opacity_instead_of_extinction_on_a_large_mesh(mesh, camera):
+    large = mesh.replace(points=1000 * mesh.points)
+    camera = camera.replace(eye=1000 * camera.eye, target=1000 * camera.target)
+    transfer = jaxvr.TransferFunction([0.0, 1.0], [[0, 0, 1], [1, 1, 0]], [0.1, 0.6])
+    message = told(large, camera, transfer)
+    assert message.startswith("One cell hides what is behind it.") and "up to 0.6" in message
+    unit = re.search(r"from_opacity\(..., unit_distance=([\d.e-]+)\)", message)
+    factor = re.search(r"transfer.scaled\(([\d.e-]+)\)", message)
+    assert unit and factor
+    meant = jaxvr.TransferFunction.from_opacity(
+        transfer.positions, transfer.colors, transfer.extinctions, float(unit[1])
+    )
+    jaxvr.render(large, camera, meant)
+    assert 0.5 < jaxvr.render(large, camera, transfer.scaled(float(factor[1])))[..., 3].max() < 1
+    jaxvr.render(large, camera, jaxvr.default_transfer(large))
+    solid = transfer.replace(extinctions=[1.0, 1.0])
+    jaxvr.render(large, camera, solid)  # hides what is behind it, on purpose
+
+
 def test_values_in_other_units(mesh, camera):
     celsius, kelvin = mesh.replace(values=20 + 60 * mesh.values), ramp(293.15, 353.15)
     message = told(celsius, camera, kelvin)
@@ -114,11 +134,19 @@ def test_values_in_other_units(mesh, camera):
     other_way = mesh.replace(values=101e3 * mesh.values - 1)
     assert "0 % of the values are" in told(other_way, camera, ramp(0, 101))
     jaxvr.render(kilopascal, camera, ramp(0, 101))
+    for factor in (50, 100):  # percent against parts of one
+        assert "it is of one colour" in told(mesh, camera, ramp(0, factor))
+        percent = mesh.replace(values=factor * mesh.values)
+        fading = jaxvr.TransferFunction.from_colormap("viridis", [0.0, 1.0], [0.0, 2.0])
+        for transfer in (ramp(), fading):
+            assert "0 % of the values are" in told(percent, camera, transfer)
     # Control points far away, or close together, are no mistake where others are at work.
     far = ramp().resample([-1e9, 0.0, 0.3, 1.0, 1e9])
     jaxvr.render(mesh, camera, far)
     peak = jaxvr.TransferFunction([0.499, 0.5, 0.501], np.ones((3, 3)), [0.0, 1e3, 0.0])
     jaxvr.render(mesh, camera, peak)
+    step = jaxvr.TransferFunction([0.495, 0.505], np.ones((2, 3)), [0.0, 9.0])
+    jaxvr.render(mesh, camera, step)
 
 
 def test_camera_that_looks_away_or_stands_inside(mesh):
@@ -134,9 +162,11 @@ def test_camera_that_looks_away_or_stands_inside(mesh):
     assert "volume lies below the picture" in told(mesh, wide, ramp())
     assert "pixels large" in told(mesh, look_at((0.5, 0.5, 4e4), (0.5, 0.5, 0)), ramp())
     inside = told(mesh, look_at((0.5, 0.6, 0.7), (0.5, 0.5, 0)), ramp())
-    assert "eye (0.5, 0.6, 0.7) lies inside the volume's box, from (0, 0, 0) to (1, 1, 1)" in inside
+    assert "eye lies inside the volume's box, from (0, 0, 0) to (1, 1, 1)" in inside
+    # The same words from elsewhere in it: Python tells them once in a flight through a volume.
+    assert told(mesh, look_at((0.5, 0.4, 0.3), (0.5, 0.5, 0)), ramp()) == inside
     cut = jaxvr.Camera.orthographic((0.5, 0.5, 0.5), (0.5, 0.5, 0), **SIZE)
-    assert "plane through the eye (0.5, 0.5, 0.5), which cuts" in told(mesh, cut, ramp())
+    assert "plane through the camera's eye, which cuts" in told(mesh, cut, ramp())
 
 
 def test_integers(mesh):
@@ -177,6 +207,30 @@ def test_transfer_function_outside_of_the_field(mesh, camera):
     assert "no extinction where the field lies" in told(cellwise, camera, between)
 
 
+def test_points_that_lose_digits_in_float32():
+    z, y, x = np.meshgrid(*[np.linspace(0, 1, 5)] * 3, indexing="ij")
+    points, cells = np.stack([x.ravel(), y.ravel(), z.ravel()], 1), grid_cells(5, 5, 5)
+
+    def build(points):
+        cube = {"hexahedron": cells}
+        return jaxvr.TetMesh.from_cells(
+            points, cube, points[:, 0], location="point", dtype="float32"
+        )
+
+    told = "points lose digits in float32. Subtract an offset .*jax_enable_x64"
+    with pytest.warns(UserWarning, match=f"degenerate .* have a volume in float64: {told}"):
+        assert build(5e6 + 1.5 * points).report.collapsed > 0
+    with pytest.raises(ValueError, match=f"No cells left.*{told}"):
+        build(1e9 + points)
+    far = 5e6 + 1.5 * points
+    assert build(far - far.mean(0)).report.collapsed == 0
+    flat = 0.1 * np.concatenate([points, points[:1]])  # cells without volume in float64 too
+    with pytest.warns(UserWarning, match=r"1 degenerate tetrahedra \(no volume\) dropped.*mesh.$"):
+        jaxvr.TetMesh.from_cells(
+            flat, {"tetra": [[0, 1, 5, 25], [0, 1, 2, 3]]}, flat[:, 0], dtype="float32"
+        )
+
+
 def test_nan_in_the_data(mesh):
     values = np.asarray(mesh.values).copy()
     values[[3, 5]] = np.nan
@@ -194,6 +248,55 @@ def test_what_is_no_mistake_gives_no_warning(mesh, camera):
         constant = jaxvr.TransferFunction([7.0], [[1.0, 0.0, 0.0]], [2.0])
         jaxvr.render(mesh, camera, constant)
         jaxvr.render(mesh.replace(values=jnp.full(mesh.n_points, 0.5)), camera, ramp())
+
+
+def test_what_stands_in_the_place_of_something_else(mesh, camera):
+    given = mesh, camera, ramp()
+    wrongs: list[tuple[str, Any, str]] = [
+        ("integrator", "analytic", r"such as jaxvr.Analytic\(\), but is 'analytic'"),
+        ("adjoint", "replay", r"such as jaxvr.Replay\(\), but is 'replay'"),
+        ("tracer", jaxvr.RayCast, r"is the class RayCast.* did you forget the \(\)"),
+        ("compositor", jaxvr.Over, r"is the class Over.* did you forget the \(\)"),
+        ("compositor", jaxvr.Analytic(), r"such as jaxvr.Over\(\), but is a Analytic"),
+    ]
+    for name, wrong, match in wrongs:
+        with pytest.raises(ValueError, match=f"{name} .*{match}"):
+            jaxvr.render(*given, **{name: wrong})
+    with pytest.raises(ValueError, match="tracer is the class"):
+        jaxvr.trace(mesh, camera, tracer=jaxvr.RayCast)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="adjoint is the class"):
+        jaxvr.fit(ramp(), mesh, camera, [], adjoint=jaxvr.Replay)  # type: ignore[arg-type]
+    verbs: list[Any] = [jaxvr.Camera.orbit, jaxvr.default_transfer]
+    for verb in verbs:
+        with pytest.raises(ValueError, match="must be a jaxvr.TetMesh, but is a str.*read_mesh"):
+            verb("a.vtu")
+    with pytest.raises(ValueError, match="segments must be a jaxvr.Segments.*jaxvr.trace"):
+        jaxvr.shade(mesh, ramp())
+
+
+def test_colours_of_a_background_in_bytes(mesh, camera, tmp_path):
+    for background in ((255, 255, 255), (0, 128, 0)):
+        with pytest.raises(ValueError, match="background holds .* from 0 to 1. Divide .* by 255"):
+            jaxvr.render(mesh, camera, ramp(), background=background)
+        with pytest.raises(ValueError, match="background holds .* from 0 to 1. Divide .* by 255"):
+            jaxvr.save_image(tmp_path / "a.png", np.zeros((4, 4, 4)), background=background)
+
+
+def test_a_fit_that_sees_nothing(mesh, camera):
+    def told_by_fit(start, cameras):
+        targets = [np.zeros((12, 16, 4), "float32")] * len(cameras)
+        with pytest.warns(ViewWarning) as caught:
+            jaxvr.fit(start, mesh, cameras, targets, iterations=1, progress=False)
+        assert len(caught) == 1 and caught[0].filename == __file__
+        return str(caught[0].message)
+
+    away = jaxvr.Camera.look_at((0.5, 0.5, 4), (0.5, 0.5, 8), **SIZE)
+    message = told_by_fit(ramp(), [camera, away, away])
+    assert "2 of 3 cameras do not see the volume" in message
+    assert "The first is cameras[1]: The volume lies behind the camera" in message
+    constant = jaxvr.TransferFunction([5.0, 6.0], np.ones((2, 3)), [1.0, 1.0])
+    for start in (ramp(5, 6), constant):
+        assert "from 0 to 1, the control points" in told_by_fit(start, [camera])
 
 
 def test_no_hints_while_tracing(mesh, camera):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import subprocess
 import sys
@@ -49,11 +50,12 @@ SCALARS = np.linspace(-0.5, 1.2, 99)
 # Every plot once: from axes (None for new ones) to the axes that it drew on.
 PLOTS = {
     "image": lambda ax: plot.image(A, ax=ax, title="one", axes=True),
-    "image_transfer": lambda ax: plot.image(A, ax=ax, transfer=JUMP, label="heat (K)"),
+    "image_transfer": lambda ax: plot.image(A, ax, transfer=JUMP, label="heat (K)"),
     "image_point": lambda ax: plot.image(A, ax=ax, transfer=NOTHING, background=(0, 0, 1)),
     "difference": lambda ax: plot.difference(A, B, title="a - b", ax=ax),
-    "equal": lambda ax: plot.difference(A, A, ax=ax),
+    "equal": lambda ax: plot.difference(A, A, ax),
     "transfer": lambda ax: plot.transfer(JUMP, ax),
+    "transfer_title": lambda ax: plot.transfer(JUMP, ax, title="one"),
     "transfer_reference": lambda ax: plot.transfer(JUMP, ax, JUMP.with_points(5), SCALARS),
     "transfer_nothing": lambda ax: plot.transfer(NOTHING, ax),
     "history": lambda ax: plot.history(RESULT, ax),
@@ -322,6 +324,26 @@ def test_k_map_has_the_colours_of_the_paper_and_counts_pixels():
         plot.k_map(KMAP, limits=(6, 2))
 
 
+def test_a_title_and_the_name_of_the_field():
+    mesh = jaxvr.datasets.box((1, 1, 1))
+    ax = plot.transfer(JUMP, title="mine", values=mesh)
+    assert (ax.get_title(), ax.get_xlabel()) == ("mine", mesh.report.field or "scalar")
+    named = dataclasses.replace(mesh, report=dataclasses.replace(mesh.report, field="pressure"))
+    assert plot.transfer(JUMP, values=named).get_xlabel() == "pressure"
+
+
+def test_what_stands_in_the_place_of_something_else():
+    with pytest.raises(ValueError, match="kmap must be a jaxvr.KMap, but is a ndarray.*measure_k"):
+        plot.k_map(np.zeros((4, 4)))
+    with pytest.raises(ValueError, match="transfer must be a jaxvr.TransferFunction, but is a str"):
+        plot.image(A, transfer="viridis")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"takes a list of images.*\(6, 9, 4\).*plot.image"):
+        plot.compare(A)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="against takes a list of images"):
+        plot.against(A, B, ["a", "b"])  # type: ignore[arg-type]
+    plot.compare(np.stack([A, B]))  # type: ignore[arg-type]
+
+
 def test_nothing_imports_pyplot_and_only_plot_draws():
     code = (
         "import sys; from jaxvr.optics.transfer import TransferFunction as T; import jaxvr.files; "
@@ -329,5 +351,10 @@ def test_nothing_imports_pyplot_and_only_plot_draws():
         "assert 'matplotlib.figure' not in sys.modules; "
         "import jaxvr.plot as p; p.transfer(T([0, 1], [[1, 0, 0]] * 2, [0, 1]))._repr_png_()\n"
         "with p.dark(): assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    code = (
+        "import sys, jaxvr; assert not hasattr(jaxvr, 'plots'); "
+        "assert 'matplotlib' not in sys.modules; jaxvr.plot.transfer"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

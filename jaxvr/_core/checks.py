@@ -15,6 +15,9 @@ import numpy as np
 
 Array = jax.Array
 
+# Light above 1 is legal, since it is brighter than a display's white; above this it is bytes.
+BRIGHTEST = 10.0
+
 
 def is_concrete(*arrays: Any) -> bool:
     """True if no argument is a tracer, so that values can be examined."""
@@ -67,6 +70,19 @@ def require_kind(name: str, x: Any, kind: type, hint: str = "") -> None:
     if not isinstance(x, kind):
         what = f"{name} must be a jaxvr.{kind.__name__}, but is a {type(x).__name__}."
         raise ValueError(f"{what} {hint}".rstrip())
+
+
+def require_light(name: str, x: Any) -> None:
+    """ValueError for colours with NaN or infinite entries, and for bytes, which `BRIGHTEST` tells
+    from light (if concrete)."""
+    require_finite(name, x)
+    if not is_concrete(x):
+        return
+    most = float(np.max(np.asarray(x), initial=0))
+    if most > BRIGHTEST:
+        raise ValueError(
+            f"{name} holds {most:g}, but colours are linear light from 0 to 1. Divide bytes by 255."
+        )
 
 
 def require_finite(name: str, x: Any) -> None:

@@ -19,10 +19,18 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from jaxvr import hints
 from jaxvr._core.checks import require_kind
 from jaxvr._core.status import check
 from jaxvr.adjoint import AbstractAdjoint
-from jaxvr.arguments import background_of
+from jaxvr.arguments import (
+    adjoint_of,
+    background_of,
+    compositor_of,
+    integrator_of,
+    tracer_of,
+    volume_of,
+)
 from jaxvr.composite import Over
 from jaxvr.fit.batches import Batch, Views, deal, gather_views, listed, make_batches, pictures_of
 from jaxvr.fit.loop import Control, batch_number, run
@@ -107,14 +115,21 @@ def fit(
     Raises:
       ValueError: for arguments that do not fit each other. FitError: if the loss becomes NaN or
         infinite. RenderError: if a ray could not be followed.
+
+    Warns with a `jaxvr.ViewWarning` of cameras that do not see the volume, and of control points
+    that do not lie where its field does.
     """
     require_kind("transfer", transfer, TransferFunction)
+    nouns = integrator_of(integrator), compositor_of(compositor), adjoint_of(adjoint)
+    nouns = (*nouns, tracer_of(tracer))
     begin = time.perf_counter()
     background = background_of(background)
     cameras, targets = listed(cameras), pictures_of(targets)
     number_seen = len(cameras)
     if len(targets) != number_seen:
         raise ValueError(f"There are {number_seen} cameras, but {len(targets)} targets.")
+    if volume is not None:
+        hints.look_before_fit(volume_of(volume), cameras, transfer, stacklevel=2)
     if held_out is not None:
         more, pictures_of_them = _pair(held_out)
         cameras, targets = cameras + listed(more), targets + pictures_of(pictures_of_them)
@@ -126,7 +141,6 @@ def fit(
     parameters = Parameters.of(transfer.astype(dtype), free)
     dealt = deal(seen, rays, views, seed)
     batches, places = make_batches(seen, dealt)
-    nouns = (integrator, compositor, adjoint, tracer)
     objective = Objective(loss_of(loss), *nouns)
     weights = [_schedule(n, w) for n, w in _weights(smoothness, smoothness_extinctions)]
     mean = jnp.mean(parameters.transfer.extinctions)
@@ -210,10 +224,10 @@ class Objective:
     """The loss of a batch under raw parameters; two of the same nouns compile once."""
 
     loss: Callable[[Array, Array], Array]
-    integrator: AbstractIntegrator | None
-    compositor: Over | None
-    adjoint: AbstractAdjoint | None
-    tracer: AbstractTracer | None
+    integrator: AbstractIntegrator
+    compositor: Over
+    adjoint: AbstractAdjoint
+    tracer: AbstractTracer
 
     @property
     def gradient(self) -> Callable[..., Any]:

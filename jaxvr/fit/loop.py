@@ -42,6 +42,11 @@ class LoopResult:
     seconds: np.ndarray
     stopped: str
 
+    def __repr__(self) -> str:
+        losses = self.loss_history
+        ends = f"loss {losses[0]:.3g} to {losses[-1]:.3g}, " if len(losses) else ""
+        return f"LoopResult({len(losses):,} iterations, {ends}stopped by {self.stopped})"
+
     @property
     def seconds_per_iteration(self) -> float:
         """Median, without the first iteration, which compiles; NaN if there was no other."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxvr._core import svg
 from jaxvr.fit.loop import LoopResult
 from jaxvr.optics.transfer import TransferFunction
 from jaxvr.view.images import psnr, ssim
@@ -31,6 +32,29 @@ class FitResult:
     stopped: str
     numbers: dict[str, Any]
 
+    def __repr__(self) -> str:
+        return f"FitResult({', '.join(f'{name} {text}' for name, text in self._facts())})"
+
+    def _repr_html_(self) -> str:
+        head = '<div style="font-weight:600">FitResult</div>'
+        drawn = self.transfer._repr_html_() or ""
+        return f'<div class="jaxvr-fit">{head}{svg.table(self._facts())}{drawn}</div>'
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """The result in a few words: labels and what stands behind them."""
+        losses, views = self.loss_history, len(self.images)
+        ends = f"{losses[0]:.3g} to {losses[-1]:.3g}" if len(losses) else "none"
+        facts = [
+            ("transfer", f"of {len(self.transfer.positions)} control points"),
+            ("iterations", f"{len(losses):,} (stopped by {self.stopped})"),
+            ("loss", ends),
+            ("views", f"{views:,}{_mean_psnr(self.numbers.get('fitted_views'))}"),
+        ]
+        if self.held_out_images:
+            scores = _mean_psnr(self.numbers.get("held_out"))
+            facts.append(("held out", f"{len(self.held_out_images):,}{scores}"))
+        return facts
+
     def report(self) -> dict[str, Any]:
         """Settings, losses, seconds, and PSNR (dB) and SSIM of each view; JSON can hold it.
 
@@ -48,6 +72,13 @@ class FitResult:
         pictures |= {f"held_out{k}": x for k, x in enumerate(self.held_out_images)}
         np.savez_compressed(path / "images.npz", **pictures)  # type: ignore[arg-type]
         return path
+
+
+def _mean_psnr(views: Any) -> str:
+    """Of what `likeness` gave, as text behind a number of views; nothing where all are equal to
+    their targets."""
+    scores = [v["psnr"] for v in views or [] if v["psnr"] is not None]
+    return f" at {np.mean(scores):.1f} dB" if scores else ""
 
 
 def likeness(images: list[np.ndarray], targets: list[np.ndarray]) -> list[dict[str, Any]]:

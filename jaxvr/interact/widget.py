@@ -43,10 +43,12 @@ class Explorer(anywidget.AnyWidget):
 
     @property
     def camera(self) -> Camera:
+        """The view as it was turned last, at full size: a start for `jaxvr.render`."""
         return self._viewer.camera
 
     @property
     def transfer(self) -> TransferFunction:
+        """The transfer function as it was edited last. Set it to show another one."""
         return self._viewer.transfer
 
     @transfer.setter
@@ -56,6 +58,8 @@ class Explorer(anywidget.AnyWidget):
 
     @property
     def image(self) -> np.ndarray:
+        """The exact picture (H, W, 4) of both, read-only, as `jaxvr.render` gives it; rendered now
+        if there is none yet."""
         return self._viewer.image
 
     def __repr__(self) -> str:

@@ -22,6 +22,8 @@ def transfer(
     ax: Axes | None = None,
     reference: TransferFunction | None = None,
     values: Any = None,
+    *,
+    title: str | None = None,
 ) -> Any:
     """Extinction against the scalar, filled with the colours; returns the axes.
 
@@ -29,7 +31,7 @@ def transfer(
       tf: the transfer function.
       reference: another one, dashed, with the colours of both as strips on top.
       values: a `TetMesh` or an array of scalars: how many values there are of each size, as a
-        faint histogram with a logarithmic height of its own.
+        faint histogram with a logarithmic height of its own. A mesh names the axis after its field.
 
     Raises ValueError for what is no transfer function, and for NaN in values.
     """
@@ -68,10 +70,11 @@ def transfer(
         _histogram(ax, data, 0.95 * top / room)
     ax.set_xlim(lo, hi)
     ax.set_ylim(0, room)
-    ax.set_xlabel("scalar")
+    ax.set_xlabel((isinstance(values, TetMesh) and values.report.field) or "scalar")
     ax.set_ylabel("extinction per unit length")
     if len(both) > 1 or data is not None:
         legend_of(ax, fontsize="small", loc="best")
+    set_title(ax, title)
     return ax
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 
-from jaxvr._core.checks import as_floats, require_finite
+from jaxvr._core.checks import as_floats, require_finite, require_kind, require_light
 from jaxvr.files import pixels
 from jaxvr.optics.transfer import TransferFunction
 from jaxvr.plot.axes import color_as, given, grid_axes, ink, picture_axes, set_title
@@ -22,8 +22,8 @@ CHEQUER = (240, 200)
 
 def image(
     image: Any,
-    *,
     ax: Axes | None = None,
+    *,
     title: str | None = None,
     background: Any = None,
     srgb: bool = False,
@@ -47,6 +47,8 @@ def image(
 
     Raises ValueError for what is no image, and for NaN.
     """
+    if transfer is not None:
+        require_kind("transfer", transfer, TransferFunction)
     shown = pixels(image, background, srgb)
     if ax is None:
         (ax,) = picture_axes(
@@ -82,6 +84,7 @@ def compare(
 
     images, titles: one each. axes: one for each picture, in any shape. The rest as for `image`.
     """
+    _require_several("compare", images)
     if len(images) == 0:
         raise ValueError("compare needs at least one image.")
     if titles is not None and len(titles) != len(images):
@@ -125,6 +128,7 @@ def against(
     Returns the axes, row by row. Raises ValueError for numbers of titles or axes that do not fit,
     for images of different sizes, and for NaN.
     """
+    _require_several("against", images)
     if len(images) == 0 or len(titles) != len(images) + 1:
         raise ValueError(
             f"against needs images, and a title for each and for the reference, but there are "
@@ -168,6 +172,14 @@ def against(
     legend = "mean of r, g, b: red is brighter, blue darker"
     last[-1].set_title(legend, fontsize="small", loc="left", color=ink(last[-1]))
     return found
+
+
+def _require_several(name: str, images: Any) -> None:
+    if getattr(images, "ndim", 4) != 4:
+        raise ValueError(
+            f"{name} takes a list of images, but was given an array of shape {images.shape}. Pass "
+            "[a, b], or show one image with plot.image."
+        )
 
 
 def _frame(ax: Axes, row: int, column: int, size: int) -> None:
@@ -216,6 +228,7 @@ def _opaque(image: Any, background: Any) -> np.ndarray:
     """An image over a background, (H, W, 3) in float64."""
     image = as_floats("image", image, ndim=3)
     if image.shape[-1] == 4:
+        require_light("background", as_floats("background", background))
         image = composite_over(image, background)
     require_finite("image", image)
     return np.asarray(image, np.float64)[..., :3]

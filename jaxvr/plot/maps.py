@@ -8,9 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from jaxvr._core.checks import as_floats, require_finite
+from jaxvr._core.checks import as_floats, require_finite, require_kind
 from jaxvr.optics.transfer import TransferFunction
 from jaxvr.plot.axes import color_as, ink, legend_of, picture_axes, set_title, whole
+from jaxvr.trace import KMap
 
 # Nothing, few entries, more, most. For people who see red and green alike they differ in lightness.
 K_COLORS = np.array([[0, 0, 0], [20, 120, 60], [250, 210, 40], [200, 20, 30]], np.uint8)
@@ -21,10 +22,10 @@ BAR = 0.95
 def difference(
     a: Any,
     b: Any,
+    ax: Axes | None = None,
     *,
     scale: float | None = None,
     title: str | None = None,
-    ax: Axes | None = None,
 ) -> Any:
     """The largest channel difference a - b in each pixel, with its sign; returns the axes.
 
@@ -96,8 +97,9 @@ def k_map(
     kmap: a `jaxvr.KMap`, as `measure_k` returns it. As in Figure 6 of Callahan et al., "Hardware-
     assisted visibility sorting for unstructured volume rendering" (2005): green where limits[0]
     entries do, yellow where limits[1] do, red where more are needed, and nothing where there is
-    nothing. The legend counts the pixels.
+    nothing. The legend counts the pixels. Raises ValueError for what is no `KMap`.
     """
+    require_kind("kmap", kmap, KMap, "Make one with jaxvr.measure_k.")
     few, many = limits
     if not 1 <= few < many:
         raise ValueError(f"limits must be two numbers, 1 <= first < second, but are {limits}.")

@@ -123,7 +123,7 @@ class Camera:
         `look_at` does, and for zoom <= 0 and for an elevation of +-90 degrees (up would point along
         the view: use `look_at` with another up).
         """
-        lo, hi = volume.bounds()
+        lo, hi = _bounds_of(volume)
         given = getattr(lo, "dtype", None)
         dtype = (
             common_float(dtype, lo) if given is None or dtype is not None else float_dtype(given)
@@ -262,6 +262,16 @@ def _rays(camera: Camera) -> tuple[Array, Array]:
 
 def _normalize(v: Array) -> Array:
     return v / jnp.sqrt(jnp.sum(v * v, axis=-1, keepdims=True))
+
+
+def _bounds_of(volume: Any) -> tuple[Any, Any]:
+    """The box of what has one, or a ValueError that says how to get it."""
+    if not callable(getattr(volume, "bounds", None)):
+        raise ValueError(
+            f"volume must be a jaxvr.TetMesh, but is a {type(volume).__name__}. Read files with "
+            "jaxvr.read_mesh, take grids of PyVista with jaxvr.TetMesh.from_pyvista."
+        )
+    return volume.bounds()
 
 
 def _make(

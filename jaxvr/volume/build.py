@@ -19,7 +19,7 @@ from . import cells as zoo
 from . import connectivity as conn
 from .geometry import signed_volumes
 from .packing import MAX_CELLS
-from .report import MeshReport
+from .report import MeshReport, collapse
 from .weld import weld
 
 # comparators of a sorting network for four keys
@@ -28,6 +28,9 @@ _NETWORK = ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2))
 # A cell is twisted if more than this part of its volume lies the other way round than the rest.
 # Thin curved cells have slivers that do; wrong orders of the nodes turn a quarter or more.
 _TWISTED = 0.05
+# Six volumes of a cell, as a part of its longest edge cubed, above which it is no sliver of
+# rounding.
+_SOLID = 1e-6
 # Cells on which other orders are tried.
 _SAMPLE = 1000
 
@@ -235,6 +238,18 @@ def _require_order(
     )
 
 
+def _collapsed(given: Any, pts: np.ndarray, tets: np.ndarray) -> int:
+    """How many of these cells without volume (N, 4) have one in the points as they were given."""
+    exact = np.asarray(given, np.float64)
+    if pts.dtype == np.float64 or np.array_equal(exact, pts):
+        return 0
+    volume, _ = signed_volumes(exact, tets)
+    corners = exact[tets]
+    edges = (corners[:, :, None] - corners[:, None]).reshape(len(tets), 16, 3)
+    longest = np.sqrt((edges**2).sum(-1).max(-1))
+    return int((np.abs(volume) > _SOLID * longest**3).sum())
+
+
 def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Built:
     """Everything but the values. Raises ValueError as `TetMesh.from_cells` says."""
     pts = read_points(points, dtype)
@@ -256,12 +271,15 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
         start += len(b.corners)
     t, p, s = np.concatenate(tets), np.concatenate(parent), np.concatenate(sign)
     made = len(t)
-    keep = s != 0
+    keep, collapsed = s != 0, 0
     if not keep.all():
+        collapsed = _collapsed(points, pts, t[~keep])
         t, p, s = t[keep], p[keep], s[keep]
     if len(t) == 0:
+        advice = f" {collapse(collapsed)}" if collapsed else ""
         raise ValueError(
-            f"No cells left: all {made} tetrahedra are degenerate (no volume, or a repeated point)."
+            f"No cells left: all {made} tetrahedra are degenerate (no volume, or a repeated "
+            f"point).{advice}"
         )
     if len(t) > MAX_CELLS:
         raise ValueError(f"The mesh has {len(t)} tetrahedra; {MAX_CELLS} is the most that fit.")
@@ -286,6 +304,7 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
         tets=len(t),
         degenerate=made - len(t),
         inverted=int((s < 0).sum()),
+        collapsed=collapsed,
         folded=int(turned.sum()),
         seams=int(((neighbors >= 0) & ((neighbors >> 3) & 1 == 1)).sum()) // 2,
         duplicate_points=len(duplicates),

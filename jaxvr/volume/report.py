@@ -13,10 +13,11 @@ class MeshReport:
 
     input_cells: cells by type as given. reduced: those of them reduced to their corners.
     ignored: points, lines and faces among the cells, left out. degenerate, inverted: tetrahedra
-    dropped for having no volume, and given the wrong way round. folded: tetrahedra that lie the
-    wrong way round among their neighbours, whichever way they are written. seams: faces whose two
-    cells use different but coincident points. one_sided: components without a consistent
-    orientation. field: the field's name where it is known.
+    dropped for having no volume, and given the wrong way round. collapsed: those dropped that have
+    a volume in the float64 that was given, but not in the float32 of the mesh. folded: tetrahedra
+    that lie the wrong way round among their neighbours, whichever way they are written. seams:
+    faces whose two cells use different but coincident points. one_sided: components without a
+    consistent orientation. field: the field's name where it is known.
     """
 
     input_cells: Counts = ()
@@ -25,6 +26,7 @@ class MeshReport:
     tets: int = 0
     degenerate: int = 0
     inverted: int = 0
+    collapsed: int = 0
     folded: int = 0
     seams: int = 0
     duplicate_points: int = 0
@@ -43,7 +45,8 @@ class MeshReport:
         if self.inverted:
             done.append(f"{self.inverted} inverted tetrahedra turned round")
         made = self.tets + self.degenerate
-        return f"{' and '.join(done)}, of {made} in the mesh." if done else None
+        advice = f" {collapse(self.collapsed)}" if self.collapsed else ""
+        return f"{' and '.join(done)}, of {made} in the mesh.{advice}" if done else None
 
     def lines(self) -> list[tuple[str, str]]:
         """The report for people: labels and what stands behind them."""
@@ -69,3 +72,12 @@ class MeshReport:
         if self.one_sided:
             out.append(("one-sided", f"{self.one_sided:,} components"))
         return out
+
+
+def collapse(count: int) -> str:
+    """Why so many cells lost their volume, and what to do."""
+    return (
+        f"{count} of them have a volume in float64: points lose digits in float32. Subtract an "
+        "offset (points - points.mean(0)) or turn on x64 "
+        '(jax.config.update("jax_enable_x64", True)).'
+    )

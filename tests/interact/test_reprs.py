@@ -13,6 +13,7 @@ from PIL import Image
 
 import jaxvr
 from jaxvr._core import svg
+from jaxvr.fit import LoopResult
 from jaxvr.interact import load_ipython_extension, unload_ipython_extension
 from jaxvr.interact.ipython import png
 
@@ -104,6 +105,23 @@ def test_reprs_say_what_matters():
     assert repr(segments) == "Segments(2 rays, 2 nodes, float64)"
     flat = jaxvr.Camera.orthographic((0, 0, 3), (0, 0, 0), extent=2)
     assert "extent=2" in repr(flat)
+
+
+def test_results_of_fits_are_short():
+    picture = np.zeros((4, 4, 4))
+    numbers = {"fitted_views": [{"psnr": 31.25}, {"psnr": None}], "held_out": [{"psnr": None}]}
+    losses = np.linspace(0.5, 0.01, 300)
+    result = jaxvr.FitResult(TRANSFER, losses, [picture] * 2, [picture], "iterations", numbers)
+    assert repr(result) == (
+        "FitResult(transfer of 4 control points, iterations 300 (stopped by iterations), "
+        "loss 0.5 to 0.01, views 2 at 31.2 dB, held out 1)"
+    )
+    page = parsed(result._repr_html_())
+    rows = {row[0].text: row[1].text or "" for row in page.iter("tr")}
+    assert rows["loss"] == "0.5 to 0.01" and any(e.tag.endswith("polyline") for e in page.iter())
+    assert "loss none" in repr(jaxvr.FitResult(TRANSFER, losses[:0], [], [], "callback", {}))
+    loop = LoopResult({"a": np.zeros(999)}, losses, losses, "patience")
+    assert repr(loop) == "LoopResult(300 iterations, loss 0.5 to 0.01, stopped by patience)"
 
 
 def test_transfer_function_shows_its_curve():
