@@ -2,8 +2,9 @@
 
     python -m notebooks.run [NAME ...]      # `make notebooks`
 
-Each in a kernel of its own, in an empty folder. Prints how long the slowest cell took. The first
-cell is tagged `parameters`; tests run the same cells with smaller ones (`SMALL`).
+Each in a kernel of its own, in an empty folder. Prints how long the slowest cell took, and fails if
+that is longer than a user would wait (`SECONDS`). The first cell is tagged `parameters`; tests run
+the same cells with smaller ones (`SMALL`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ FOLDER = Path(__file__).resolve().parent
 SMALL = {"SIZE": 32, "ITERATIONS": 4}
 # What a notebook may weigh, with its pictures.
 BYTES = 3_000_000
+# What a cell may take, on two cores.
+SECONDS = 30
 
 
 def notebooks() -> list[Path]:
@@ -75,6 +78,8 @@ def main(arguments: list[str] | None = None) -> None:
         seconds, size = run(path), path.stat().st_size
         slowest = f"slowest cell {max(seconds):5.1f} s"
         print(f"{path.name:28s} {sum(seconds):6.1f} s, {slowest}, {size:,} bytes", flush=True)
+        if max(seconds) > SECONDS:
+            raise SystemExit(f"A cell of {path.name} takes too long: {SECONDS} s are allowed.")
         if size > BYTES:
             raise SystemExit(f"{path.name} is too large: {size:,} bytes, {BYTES:,} allowed.")
 

@@ -30,6 +30,17 @@ PAGES = {
     "Plots": ("plot",),
     "Notebooks": ("interact",),
 }
+# What users subclass or are given, but do not import from the top.
+MORE = {
+    "Volumes": ("jaxvr.volume.readers.Field",),
+    "Transfer functions and integrators": (
+        "jaxvr.optics.integrator.AbstractIntegrator",
+        "jaxvr.optics.integrator.AbstractSlabIntegrator",
+    ),
+    "Tracers and orders": ("jaxvr.trace.base.AbstractTracer", "jaxvr.trace.recorded.Recorded"),
+    "Compositors and adjoints": ("jaxvr.adjoint.base.AbstractAdjoint",),
+    "Notebooks": ("jaxvr.interact.widget.Explorer",),
+}
 
 
 def public() -> dict[str, list[str]]:
@@ -49,6 +60,8 @@ def public() -> dict[str, list[str]]:
             found[page_of[thing.__module__.split(".")[1]]].append(where(thing))
     found["Plots"] += [where(getattr(jaxvr.plot, x)) for x in jaxvr.plot.__all__]
     found["Fitting"].append("jaxvr.fit.parameters")
+    for page, names in MORE.items():
+        found[page] += names
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import re
 import shlex
 from pathlib import Path
@@ -22,6 +23,7 @@ from notebooks.site import collect, listed, public
 ROOT = Path(__file__).resolve().parents[1]
 OTHERS = sorted([*ROOT.glob("notebooks/*.md"), *ROOT.glob("experiments/*.md")])
 PAGES = [ROOT / "README.md", *OTHERS]
+NOTEBOOKS = sorted(ROOT.glob("notebooks/*.ipynb"))
 GUIDES = [p for p in PAGES if p.parent.name != "experiments"]
 
 
@@ -70,15 +72,24 @@ def test_commands_of_the_readme_run_as_printed(tmp_path, monkeypatch, capsys, qu
     assert (tmp_path / "folder" / "transfer.json").exists()
 
 
+def prose(page: Path) -> str:
+    """What is written on a page or in a notebook, without code."""
+    text = page.read_text()
+    if page.suffix == ".ipynb":
+        cells = json.loads(text)["cells"]
+        text = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+    return re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
+
+
 def anchors(page: Path) -> set[str]:
     """Anchors of the headings, as repository pages make them."""
-    headings = re.findall(r"^#+ +(.*)$", page.read_text(), re.M)
+    headings = re.findall(r"^#+ +(.*)$", prose(page), re.M)
     return {re.sub(r"[^\w\- ]", "", h.lower()).strip().replace(" ", "-") for h in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=name_of)
 def test_links_lead_somewhere(page):
-    for text, target in re.findall(r"\[([^\]]*)\]\(([^)\s]+)\)", page.read_text()):
+    for text, target in re.findall(r"\[([^\]]*)\]\(([^)\s]+)\)", prose(page)):
         if re.match(r"[a-z]+:", target):
             continue
         file, _, anchor = target.partition("#")
@@ -90,7 +101,7 @@ def test_links_lead_somewhere(page):
 
 def test_every_experiment_and_notebook_is_linked():
     text = "".join(p.read_text() for p in PAGES)
-    for file in [*ROOT.glob("notebooks/*.ipynb"), *OTHERS]:
+    for file in [*NOTEBOOKS, *OTHERS]:
         assert file.name in text, f"no page links to {file.name}"
 
 
@@ -130,6 +141,8 @@ def test_public_names_are_documented(dotted):
         elif inspect.isfunction(function):
             own = inspect.getdoc(getattr(thing, name)) or ""
             assert own, f"{dotted}.{name} has no docstring"
+            if isinstance(member, classmethod):  # another way to make one, with its own arguments
+                require_arguments(f"{dotted}.{name}", getattr(thing, name), own + text)
 
 
 def require_arguments(dotted, function, text):

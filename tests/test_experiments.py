@@ -5,6 +5,7 @@ To add one: a function from a folder to a number, and the bounds that it must li
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 
@@ -211,3 +212,13 @@ EXPERIMENTS = [
 )
 def test_experiment(run, low, high, tmp_path, quick_jit):
     assert low < run(tmp_path / "out") < high
+
+
+SCRIPTS = sorted(p.stem for p in Path(__file__).parents[1].glob("experiments/[a-z]*.py"))
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_scripts_can_be_imported_and_say_what_they_do(name):
+    """Also those that need a browser, a network or an hour, and do not run here."""
+    script = importlib.import_module(f"experiments.{name}")
+    assert script.__doc__
