@@ -9,6 +9,7 @@ public name by room; its text is the docstrings, so there is nothing to keep in 
 from __future__ import annotations
 
 import argparse
+import importlib
 import inspect
 import re
 import shutil
@@ -59,7 +60,9 @@ def public() -> dict[str, list[str]]:
         else:
             found[page_of[thing.__module__.split(".")[1]]].append(where(thing))
     found["Plots"] += [where(getattr(jaxvr.plot, x)) for x in jaxvr.plot.__all__]
-    found["Fitting"].append("jaxvr.fit.parameters")
+    fitting = importlib.import_module("jaxvr.fit")  # `jaxvr.fit` is the function
+    names = [where(getattr(fitting, x)) for x in fitting.__all__]
+    found["Fitting"] += [x for x in names if x not in found["Fitting"]]
     for page, names in MORE.items():
         found[page] += names
     return found

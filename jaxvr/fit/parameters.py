@@ -135,8 +135,9 @@ class Parameters:
 def noise(positions: Any, extinction: Any, seed: int = 0, *, dtype: Any = None) -> TransferFunction:
     """A transfer function to start from: colours sigmoid(n), extinctions extinction * softplus(n).
 
-    positions (K,), n standard normal. `extinction` (): per unit of length, of the size expected;
-    a few divided by the volume's diagonal is a good choice.
+    positions (K,); n standard normal, from `seed`. `extinction` (): per unit of length, of the size
+    expected; a few divided by the volume's diagonal is a good choice. dtype: that of positions if
+    None.
     """
     positions = np.asarray(as_floats("positions", positions, ndim=1))
     rng = np.random.default_rng(seed)

@@ -63,7 +63,8 @@ class FitResult:
         return json.loads(json.dumps(self.numbers))
 
     def save(self, folder: Any) -> Path:
-        """Writes transfer.json, report.json and images.npz (view0, ..., held_out0, ...)."""
+        """Writes transfer.json, report.json and images.npz (view0, ..., held_out0, ...) to a
+        `folder`, which is made if need be. Returns its path."""
         path = Path(folder)
         path.mkdir(parents=True, exist_ok=True)
         self.transfer.to_json(path / "transfer.json")

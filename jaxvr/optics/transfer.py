@@ -230,7 +230,7 @@ class TransferFunction:
         return self.resample(jnp.linspace(self.positions[0], self.positions[-1], n))
 
     def scaled(self, extinction_factor: Any) -> TransferFunction:
-        """With all extinctions multiplied by a number >= 0."""
+        """With all extinctions multiplied by extinction_factor (), a number >= 0."""
         factor = as_floats("extinction_factor", extinction_factor, ndim=0, dtype=self.dtype)
         return self.replace(extinctions=self.extinctions * factor)
 
@@ -290,8 +290,11 @@ class TransferFunction:
     ) -> TransferFunction:
         """From what `to_json` wrote, or from a colour map exported by ParaView as JSON.
 
-        `source` is a path, JSON text, or what `json.load` returned. The keywords but `dtype` are
-        for ParaView's files: see `jaxvr.optics.transfer_json`.
+        source: a path, JSON text, or what `json.load` returned. dtype: defaults to that of the file
+        (float64 only where JAX allows it), for ParaView's files to JAX's default float. The rest is
+        for ParaView's files: unit_distance and convention as in `from_opacity`; points: about how
+        many control points to add where a curve is not linear; name: which colour map, if there are
+        several; srgb: decode colours from sRGB. Raises ValueError for neither format.
         """
         from jaxvr.optics import transfer_json
 

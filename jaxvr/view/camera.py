@@ -118,10 +118,11 @@ class Camera:
         """A pinhole camera on a sphere round the volume; at zoom 1 its bounding ball fits the fov.
 
         target = centre of the bounding box, R = half its diagonal, eye = target
-        + R/sin(fov/2)/zoom * (cos(el) sin(az), sin(el), cos(el) cos(az)), up = (0, 1, 0). Angles
-        are in degrees. The dtype defaults to that of `volume.bounds()`. Raises ValueError as
-        `look_at` does, and for zoom <= 0 and for an elevation of +-90 degrees (up would point along
-        the view: use `look_at` with another up).
+        + R/sin(fov/2)/zoom * (cos(el) sin(az), sin(el), cos(el) cos(az)), up = (0, 1, 0). Azimuth
+        az, elevation el and fov are in degrees; from azimuth 0 one looks along -z. The dtype
+        defaults to that of `volume.bounds()`. Raises ValueError as `look_at` does, for zoom <= 0,
+        and for an elevation of +-90 degrees (up would point along the view: use `look_at` with
+        another up).
         """
         lo, hi = _bounds_of(volume)
         given = getattr(lo, "dtype", None)
@@ -152,7 +153,8 @@ class Camera:
         *,
         dtype: Any = None,
     ) -> list[Camera]:
-        """`n` orbiting cameras spread evenly over the sphere, on a Fibonacci lattice.
+        """`n` orbiting cameras spread evenly over the sphere, on a Fibonacci lattice; volume, fov,
+        zoom, width, height and dtype as for `orbit`.
 
         View k has sin(elevation) = 1 - (2k + 1)/n and azimuth k times the golden angle
         (González, "Measurement of areas on a sphere using Fibonacci and latitude-longitude
@@ -179,7 +181,7 @@ class Camera:
     def from_vtk(
         source: Any, width: int | None = None, height: int | None = None, dtype: Any = None
     ) -> Camera:
-        """The view of a vtkCamera, a pyvista.Camera, a vtkRenderer or a pyvista.Plotter.
+        """The view of a source: a vtkCamera, a pyvista.Camera, a vtkRenderer or a pyvista.Plotter.
 
         width, height: in pixels; `None` takes those of the plotter's or renderer's window, or 512
             for a camera alone.
