@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import numpy as np
 from scipy.spatial import Delaunay
 
@@ -42,6 +43,7 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, views: int, shares: list[fl
         row["change"] = float(np.abs(after - before).max())
         rows.append(row)
         print(table([row]), flush=True)
+        jax.clear_caches()  # each has shapes of its own, and Linux bounds the pieces of compiled code
     return rows
 
 
