@@ -21,7 +21,7 @@ import jaxvr
 from experiments.common import read_volume, table, transfer_of
 from experiments.havs import options, report, viewpoints, volumes
 
-LITTLE, MUCH = 1 << 16, 1 << 25  # bytes; the default is 1 << 19
+LITTLE, MUCH = 1 << 16, 1 << 25  # bytes; the default is 0.4 MB
 
 
 def reserved(volume: jaxvr.TetMesh, size: int, tracer: Any, budget: int | None) -> int:

@@ -43,7 +43,7 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, views: int, shares: list[fl
         row["change"] = float(np.abs(after - before).max())
         rows.append(row)
         print(table([row]), flush=True)
-        jax.clear_caches()  # each has shapes of its own, and Linux bounds the pieces of compiled code
+        jax.clear_caches()  # each has shapes of its own, and Linux bounds the memory maps of code
     return rows
 
 
