@@ -14,13 +14,14 @@ welded ids, so both sides of a seam are cut alike, each with a midpoint of its o
 
 Which cells first? Of those that deviate clearly the longest: for as many added cells that lowered
 the k that a k-buffer needs more than going by deviation, by its depth as a length, or by products
-of the two. Whether k is lowered at all depends on the mesh. Means over six views of the largest k,
-before and after `refine` with its defaults: 26,000 Delaunay cells of random points, squeezed along
-z to three tenths, 48.0 and 39.3 (32.3 by size alone), to one tenth, 85.5 and 76.3 (71.3). But in
-can.vtu, thin cells all over, 28.0 and 31.3: a face that stays large has more faces beside it than
-before. bluntfin.vtu comes back as it is, since its cells, however thin, are Delaunay to within 4 %
-of the radius; by size alone k rises there from 59 to 75. So measure. Nor is the result a Delaunay
-mesh: midpoints lie in other cells' spheres, and halves of slivers are slivers.
+of the two. Whether k is lowered at all depends on the mesh (`experiments/havs.md`). Means over six
+views of the largest k, before and after `refine` with its defaults: 26,500 Delaunay cells of random
+points, squeezed along z to three tenths, 88 and 71 (71 by size alone too); to one tenth, where
+nearly all are thin, 101 and 101. In can.vtu, thin cells all over, 28 and 34: a face that stays
+large has more faces beside it than before. bluntfin.vtu comes back as it is, since its cells,
+however thin, are Delaunay to within 4 % of the radius; by size alone k rises there from 59 to 75.
+So measure. Nor is the result a Delaunay mesh: midpoints lie in other cells' spheres, and halves of
+slivers are slivers.
 """
 
 from __future__ import annotations
