@@ -127,7 +127,7 @@ def shading(integrator: Any):
 
 def truth_of(segments: jaxvr.Segments, transfer: Any, weights: np.ndarray):
     """Image and gradients by `Analytic` in float64."""
-    with jax.enable_x64(True):
+    with with_x64():
         double = dataclasses.replace(
             segments,
             scalar=jnp.asarray(np.asarray(segments.scalar), jnp.float64),
