@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 
 import jaxvr
-from experiments.common import write_json
+from experiments.common import with_x64, write_json
 from experiments.speed import camera_of, median_of, transfer_of
 
 # How many batches of rays one timing of slabs runs through, and of how many rays each.
