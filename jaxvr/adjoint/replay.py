@@ -56,6 +56,8 @@ class Replay(AbstractAdjoint):
     function. Gradients that are not asked for are not computed. First derivatives only.
 
     native: whether to use compiled loops (see `jaxvr.native`); None for where they can be used.
+        That is asked at every call of `render` and its like, outside of their own `jit`; under
+        yours it is asked while tracing, and the answer is compiled in.
     """
 
     native: bool | None = None
@@ -64,6 +66,18 @@ class Replay(AbstractAdjoint):
         dtype = jax.tree.leaves(operands.table)[0].dtype
         nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
         return _replay(pipeline, native.covers(self.native, dtype, *nouns), operands)
+
+
+def settle(adjoint: Any, pipeline: Pipeline, dtype: Any) -> Any:
+    """The adjoint with the loops that serve decided on: a part of what a compiled function depends
+    on, or a cached one would keep the answer that the environment and the backend gave once.
+
+    dtype: of the volume. Raises ValueError as `native.covers`.
+    """
+    if not isinstance(adjoint, Replay):
+        return adjoint
+    nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
+    return dataclasses.replace(adjoint, native=native.covers(adjoint.native, dtype, *nouns))
 
 
 @pytree
