@@ -73,6 +73,8 @@ class Replay(AbstractAdjoint):
     function. Gradients that are not asked for are not computed. First derivatives only.
 
     native: whether to use compiled loops (see `jaxvr.native`); None for where they can be used.
+        That is asked at every call of `render` and its like, outside of their own `jit`; under
+        yours it is asked while tracing, and the answer is compiled in.
     """
 
     native: bool | None = None
@@ -88,6 +90,18 @@ def _flags(asked: Sequence[bool]) -> tuple[Array, ...]:
     """Flags as the shapes (0 or 1, 0) of empty arrays: see the module. Two axes, so that a sharded
     loop has one to name."""
     return tuple(jnp.zeros((int(flag), 0), bool) for flag in asked)
+
+
+def settle(adjoint: Any, pipeline: Pipeline, dtype: Any) -> Any:
+    """The adjoint with the loops that serve decided on: a part of what a compiled function depends
+    on, or a cached one would keep the answer that the environment and the backend gave once.
+
+    dtype: of the volume. Raises ValueError as `native.covers`.
+    """
+    if not isinstance(adjoint, Replay):
+        return adjoint
+    nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
+    return dataclasses.replace(adjoint, native=native.covers(adjoint.native, dtype, *nouns))
 
 
 def _run(pipeline: Pipeline, compiled: bool, operands: Operands):
