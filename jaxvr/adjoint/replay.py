@@ -11,6 +11,13 @@ Where the transfer function is transparent, light is neither added nor lost: the
 such a stretch in one piece, whatever control points lie in it. The backward pass does so only if no
 gradient of the transfer function is asked for, since extinction has one at 0 too.
 
+What a gradient is asked for is known to the forward rule alone, and the backward rule has to be told.
+JAX traces the forward rule once for each pattern of perturbed operands and keeps those traces, but
+of the *structure* of residuals, of their number, and of which of them are operands, it keeps what
+the trace made last had. So these may depend on nothing but the structure of the arguments: a flag
+there would be read by pullbacks of other patterns, whose gradients then are 0 without a word. Flags
+travel as shapes of empty arrays, which belong to the trace itself.
+
 Path replay is due to Vicini, Speierer and Jakob 2021; unlike theirs and DiffDVR's (Weiss and
 Westermann 2021) it divides by no transmittance: an opaque cell is no singularity.
 """
@@ -18,6 +25,7 @@ Westermann 2021) it divides by no transmittance: an opaque cell is no singularit
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -27,7 +35,6 @@ import numpy as np
 from jax import lax
 
 from jaxvr import native
-from jaxvr._core.pytree import pytree, static
 from jaxvr.adjoint.base import (
     AbstractAdjoint,
     March,
@@ -66,11 +73,10 @@ class Replay(AbstractAdjoint):
         return _replay(pipeline, native.covers(self.native, dtype, *nouns), operands)
 
 
-@pytree
-class _Asked:
-    """Which leaves of the operands a gradient is asked for: structure, not data."""
-
-    leaves: tuple[bool, ...] = static()
+def _flags(asked: Sequence[bool]) -> tuple[Array, ...]:
+    """Flags as the shapes (0 or 1, 0) of empty arrays: see the module. Two axes, so that a sharded
+    loop has one to name."""
+    return tuple(jnp.zeros((int(flag), 0), bool) for flag in asked)
 
 
 def _run(pipeline: Pipeline, compiled: bool, operands: Operands):
@@ -102,9 +108,8 @@ def _forward(pipeline: Pipeline, compiled: bool, primals: Any):
         primals, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
     )
     operands = structure.unflatten([leaf.value for leaf in leaves])
-    asked = _Asked(tuple(leaf.perturbed for leaf in leaves))
     result, pixel = _run(pipeline, compiled, operands)
-    return result, (operands, pixel, asked)
+    return result, (operands, pixel, _flags([leaf.perturbed for leaf in leaves]))
 
 
 def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: Any):
@@ -115,7 +120,7 @@ def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: An
         rgba_bar = jnp.zeros(aval.shape, aval.dtype)
     tracer, integrator = pipeline.tracer, pipeline.integrator
     structure = jax.tree.structure(operands)
-    perturbed: Operands = jax.tree.unflatten(structure, asked.leaves)
+    perturbed: Operands = jax.tree.unflatten(structure, [flag.shape[0] == 1 for flag in asked])
     optical = any(jax.tree.leaves(perturbed.table))
     # Where it is transparent, segments have no gradient, but the transfer function has.
     table = operands.table if optical else integrator.shorten(operands.table, False)
