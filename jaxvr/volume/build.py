@@ -36,8 +36,8 @@ _TWISTED = 0.05
 # Six volumes of a cell, as a part of its longest edge cubed, above which it is no sliver of
 # rounding.
 _SOLID = 1e-6
-# The same for a cell that lies the wrong way round among its neighbours: half the digits of float64,
-# in which meshes are made. Generators compare squares of lengths (circumspheres of nearly
+# The same for a cell that lies the wrong way round among its neighbours: half the digits of
+# float64, in which meshes are made. Generators compare squares of lengths (circumspheres of nearly
 # cospherical points), which tell lengths to the root of the rounding only; so a fold lower than
 # that is theirs. Qhull returns some on lattices jittered by 1e-12, about 1e-11 high.
 _RESOLVED = 2.0**-26

@@ -40,7 +40,7 @@ def signed_volumes(points: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np
 
 
 def flat_cells(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Which tetrahedra (T,) bool have no volume beyond the rounding of points (P, 3) in their dtype.
+    """Which tetrahedra (T,) bool have no volume beyond the rounding of their points (P, 3).
 
     With d a bound on how far rounding may have moved any coordinate of the corners q_v, N_v twice
     the area vector of the face opposite q_v and e the six edges, six volumes may have changed by

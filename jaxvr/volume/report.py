@@ -88,7 +88,7 @@ class MeshReport:
 def collapse(count: int) -> str:
     """Why so many cells lost their volume, and what to do."""
     return (
-        f"{count} of those without volume have a volume in float64: points lose digits in float32. Subtract an "
+        f"{count} of them have a volume in float64: points lose digits in float32. Subtract an "
         "offset (points - points.mean(0)) or turn on x64 "
         '(jax.config.update("jax_enable_x64", True)).'
     )
