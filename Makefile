@@ -1,5 +1,7 @@
 # make demo       fit a transfer function on a generated mesh; pictures and a report in output/demo
 # make test       lint, then all tests (sets up everything it needs)
+# make quick      lint, then the tests that touch every room, in two minutes
+# make pythons    the same tests with the other Pythons that are found, oldest and newest JAX
 # make lint       ruff and pyright only
 # make docs       the documentation as a site, in output/site
 # make notebooks  run the notebooks and keep their pictures
@@ -14,13 +16,19 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint docs notebooks venv clean
+.PHONY: demo test quick pythons lint docs notebooks venv clean
 
 demo: $(VENV)/.package
 	$(BIN)/python -m experiments.demo --out output/demo
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadscope
+
+quick: lint
+	$(BIN)/python -m pytest -m rooms -n 2 --dist loadscope
+
+pythons:
+	$(PYTHON) .ci/pythons.py
 
 lint: $(VENV)/.tools
 	$(BIN)/ruff check .
@@ -58,5 +66,5 @@ $(VENV)/.docs: pyproject.toml | $(VENV)/.made
 	@touch $@
 
 clean:
-	rm -rf $(VENV) output dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-* output dist .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

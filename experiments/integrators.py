@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 
 import jaxvr
-from experiments.common import write_json
+from experiments.common import with_x64, write_json
 from experiments.speed import camera_of, median_of, transfer_of
 
 # How many batches of rays one timing of slabs runs through, and of how many rays each.
@@ -127,7 +127,7 @@ def shading(integrator: Any):
 
 def truth_of(segments: jaxvr.Segments, transfer: Any, weights: np.ndarray):
     """Image and gradients by `Analytic` in float64."""
-    with jax.enable_x64(True):
+    with with_x64():
         double = dataclasses.replace(
             segments,
             scalar=jnp.asarray(np.asarray(segments.scalar), jnp.float64),

@@ -23,9 +23,11 @@ from jax import lax
 from jaxvr import hints
 from jaxvr import native as compiled
 from jaxvr._core.checks import is_concrete
+from jaxvr._core.modes import custom_vjp_refused
 from jaxvr._core.status import LOST, check
 from jaxvr.adjoint import AbstractAdjoint, Pipeline
 from jaxvr.adjoint.base import Operands
+from jaxvr.adjoint.replay import FORWARD_MODE, settle
 from jaxvr.arguments import (
     adjoint_of,
     background_of,
@@ -103,10 +105,9 @@ def render(
     pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
     camera = camera_of(camera, volume_of(volume))
     transfer = transfer_of(transfer, volume)
-    image, bits, seen = _render(
-        *(pipeline, adjoint_of(adjoint), _batch_size(budget, volume), volume, camera, transfer),
-        background_of(background),
-    )
+    how = _how(pipeline, adjoint, budget, volume)
+    with custom_vjp_refused(FORWARD_MODE):
+        image, bits, seen = _render(*how, volume, camera, transfer, background_of(background))
     if status:
         return image, bits
     if is_concrete(bits):
@@ -145,10 +146,11 @@ def render_rays(
     pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
     origins, directions = rays_of(origins, directions, volume_of(volume))
     transfer = transfer_of(transfer, volume)
-    rgba, bits = _render_rays(
-        *(pipeline, adjoint_of(adjoint), _batch_size(budget, volume)),
-        *(volume, origins, directions, transfer, background_of(background)),
-    )
+    how = _how(pipeline, adjoint, budget, volume)
+    with custom_vjp_refused(FORWARD_MODE):
+        rgba, bits = _render_rays(
+            *how, volume, origins, directions, transfer, background_of(background)
+        )
     if status:
         return rgba, bits
     if is_concrete(bits):
@@ -238,10 +240,15 @@ def shade(
     segments = segments_of(segments)
     pipeline = _pipeline(Recorded(), integrator, compositor)
     transfer = transfer_of(transfer, segments)
-    size = _batch_size(budget, segments)
-    return _shade(
-        pipeline, adjoint_of(adjoint), size, segments, transfer, background_of(background)
-    )
+    how = _how(pipeline, adjoint, budget, segments)
+    with custom_vjp_refused(FORWARD_MODE):
+        return _shade(*how, segments, transfer, background_of(background))
+
+
+def _how(pipeline: Pipeline, adjoint: Any, budget: Any, volume: Any) -> tuple[Any, Any, int]:
+    """What a compiled function depends on beside shapes: nouns, which loops serve, rays at once."""
+    adjoint = settle(adjoint_of(adjoint), pipeline, dtype_of(volume))
+    return pipeline, adjoint, _batch_size(budget, volume)
 
 
 def _pipeline(

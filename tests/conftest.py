@@ -14,6 +14,7 @@ os.environ["XLA_FLAGS"] = " ".join(
 
 import jax
 import pytest
+from rooms import *  # noqa: F403 (hooks of pytest)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -2,7 +2,8 @@
 those of exactness, lost rays and speed keep what users get. (What XLA reserves is decided before.)
 
 Compiling is nearly all the time that the tests take. Left out are LLVM's optimiser, and XLA's
-emitters by way of MLIR, which set up a compiler for each kernel; its older ones do the same.
+emitters by way of MLIR, which set up a compiler for each kernel; its older ones, where there are
+any, do the same.
 """
 
 from __future__ import annotations
@@ -12,12 +13,32 @@ import importlib
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxvr._core.checks import is_concrete
 
 PLAIN = jax.jit
-EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
-jit = functools.partial(jax.jit, compiler_options=EMITTERS | {"xla_backend_optimization_level": 0})
+
+
+def accepted(options: dict[str, Any]) -> dict[str, Any]:
+    """Those of some options that the installed XLA has. Options come and go with its versions (the
+    older emitters went with jax 0.12), and only compiling tells."""
+
+    def known(name: str) -> bool:
+        try:
+            PLAIN(jnp.negative, compiler_options={name: options[name]})(1.0)
+        except jax.errors.JaxRuntimeError as error:
+            if "No such compile option" not in str(error):
+                raise
+            return False
+        return True
+
+    return {name: value for name, value in options.items() if known(name)}
+
+
+EMITTERS = accepted({"xla_cpu_use_fusion_emitters": False})
+UNOPTIMISED = accepted({"xla_backend_optimization_level": 0})
+jit = functools.partial(jax.jit, compiler_options=EMITTERS | UNOPTIMISED)
 # With LLVM's optimiser, which fuses products and sums: where those may be rounded once or twice.
 rounded_jit = functools.partial(jax.jit, compiler_options=EMITTERS)
 

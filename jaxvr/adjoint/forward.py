@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 
+from jaxvr._core.modes import forward_only
 from jaxvr.adjoint.base import AbstractAdjoint, finish, march_while, run_batches
+
+_REVERSE = (
+    "Forward gives forward mode (jvp, jacfwd, linearize) only. For reverse mode (grad, vjp, "
+    "jacrev) render with adjoint=Replay(), the default, or with adjoint=Direct(max_steps) on small "
+    "problems."
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Forward(AbstractAdjoint):
-    """`jvp`, `jacfwd` and `linearize`-free forward mode; reverse mode is an error of JAX.
+    """`jvp`, `jacfwd` and `linearize`-free forward mode; reverse mode is an error.
 
     Costs one render and about as much again for each tangent, at constant memory. Use it for a
     handful of parameters (a camera, one light), for Jacobian-vector products, and to check the
@@ -17,4 +24,5 @@ class Forward(AbstractAdjoint):
     """
 
     def run(self, pipeline, operands):
-        return run_batches(lambda one: finish(pipeline, march_while(pipeline, one)), operands)
+        result = run_batches(lambda one: finish(pipeline, march_while(pipeline, one)), operands)
+        return forward_only(result, _REVERSE)

@@ -11,12 +11,12 @@ Where the transfer function is transparent, light is neither added nor lost: the
 such a stretch in one piece, whatever control points lie in it. The backward pass does so only if no
 gradient of the transfer function is asked for, since extinction has one at 0 too.
 
-What a gradient is asked for is known to the forward rule alone, and the backward rule has to be told.
-JAX traces the forward rule once for each pattern of perturbed operands and keeps those traces, but
-of the *structure* of residuals, of their number, and of which of them are operands, it keeps what
-the trace made last had. So these may depend on nothing but the structure of the arguments: a flag
-there would be read by pullbacks of other patterns, whose gradients then are 0 without a word. Flags
-travel as shapes of empty arrays, which belong to the trace itself.
+What a gradient is asked for is known to the forward rule alone, and the backward rule has to be
+told. JAX traces the forward rule once for each pattern of perturbed operands and keeps those
+traces, but of the *structure* of residuals, of their number, and of which of them are operands, it
+keeps what the trace made last had. So these may depend on nothing but the structure of the
+arguments: a flag there would be read by pullbacks of other patterns, whose gradients then are 0
+without a word. Flags travel as shapes of empty arrays, which belong to the trace itself.
 
 Path replay is due to Vicini, Speierer and Jakob 2021; unlike theirs and DiffDVR's (Weiss and
 Westermann 2021) it divides by no transmittance: an opaque cell is no singularity.
@@ -35,6 +35,7 @@ import numpy as np
 from jax import lax
 
 from jaxvr import native
+from jaxvr._core.modes import constant, reverse_only
 from jaxvr.adjoint.base import (
     AbstractAdjoint,
     March,
@@ -50,19 +51,30 @@ from jaxvr.adjoint.base import (
 
 Array = jax.Array
 
+FORWARD_MODE = (
+    "Replay gives reverse mode (grad, vjp, jacrev) only. For forward mode (jvp, jacfwd, linearize) "
+    "render with adjoint=Forward(), or with adjoint=Direct(max_steps) on small problems."
+)
+_SECOND = (
+    "Replay gives first derivatives only. Second ones by colours and extinctions are given by "
+    "adjoint=Direct(max_steps) in any mode, and by adjoint=Forward() in forward mode (jvp of jvp)."
+)
+
 # Numbers in a table whose gradient is summed batch by batch.
 _SMALL_TABLE = 1 << 16
 
 
 @dataclasses.dataclass(frozen=True)
 class Replay(AbstractAdjoint):
-    """Reverse mode (`grad`, `vjp`, `value_and_grad`); forward mode is an error of JAX.
+    """Reverse mode (`grad`, `vjp`, `value_and_grad`); forward mode is an error.
 
     Memory: the result, its operands, and one gradient; it does not grow with cells per ray. Time:
     the render plus a walk that also differentiates, about two to four renders for the transfer
     function. Gradients that are not asked for are not computed. First derivatives only.
 
     native: whether to use compiled loops (see `jaxvr.native`); None for where they can be used.
+        That is asked at every call of `render` and its like, outside of their own `jit`; under
+        yours it is asked while tracing, and the answer is compiled in.
     """
 
     native: bool | None = None
@@ -70,13 +82,26 @@ class Replay(AbstractAdjoint):
     def run(self, pipeline, operands):
         dtype = jax.tree.leaves(operands.table)[0].dtype
         nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
-        return _replay(pipeline, native.covers(self.native, dtype, *nouns), operands)
+        compiled = native.covers(self.native, dtype, *nouns)
+        return _replay(pipeline, compiled, reverse_only(operands, FORWARD_MODE))
 
 
 def _flags(asked: Sequence[bool]) -> tuple[Array, ...]:
     """Flags as the shapes (0 or 1, 0) of empty arrays: see the module. Two axes, so that a sharded
     loop has one to name."""
     return tuple(jnp.zeros((int(flag), 0), bool) for flag in asked)
+
+
+def settle(adjoint: Any, pipeline: Pipeline, dtype: Any) -> Any:
+    """The adjoint with the loops that serve decided on: a part of what a compiled function depends
+    on, or a cached one would keep the answer that the environment and the backend gave once.
+
+    dtype: of the volume. Raises ValueError as `native.covers`.
+    """
+    if not isinstance(adjoint, Replay):
+        return adjoint
+    nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
+    return dataclasses.replace(adjoint, native=native.covers(adjoint.native, dtype, *nouns))
 
 
 def _run(pipeline: Pipeline, compiled: bool, operands: Operands):
@@ -108,7 +133,7 @@ def _forward(pipeline: Pipeline, compiled: bool, primals: Any):
         primals, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
     )
     operands = structure.unflatten([leaf.value for leaf in leaves])
-    result, pixel = _run(pipeline, compiled, operands)
+    result, pixel = _run(pipeline, compiled, constant(operands, _SECOND))
     return result, (operands, pixel, _flags([leaf.perturbed for leaf in leaves]))
 
 
@@ -125,6 +150,7 @@ def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: An
     # Where it is transparent, segments have no gradient, but the transfer function has.
     table = operands.table if optical else integrator.shorten(operands.table, False)
     if compiled:
+        rgba_bar = constant(rgba_bar, _SECOND)
         scene_bar, rays_bar, table_bar = native.kernels.pull_back(
             *(operands.scene, operands.rays, table, integrator, pipeline.compositor),
             final=finals,

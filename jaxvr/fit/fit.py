@@ -22,7 +22,8 @@ import optax
 from jaxvr import hints
 from jaxvr._core.checks import require_kind
 from jaxvr._core.status import check
-from jaxvr.adjoint import AbstractAdjoint
+from jaxvr.adjoint import AbstractAdjoint, Pipeline
+from jaxvr.adjoint.replay import settle
 from jaxvr.arguments import (
     adjoint_of,
     background_of,
@@ -40,7 +41,7 @@ from jaxvr.fit.parameters import Parameters
 from jaxvr.fit.report import FitResult, likeness, number, timing
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.render import render_rays, shade
-from jaxvr.trace import AbstractTracer, Segments
+from jaxvr.trace import AbstractTracer, Recorded, Segments
 
 Array = jax.Array
 
@@ -141,7 +142,7 @@ def fit(
     parameters = Parameters.of(transfer.astype(dtype), free)
     dealt = deal(seen, rays, views, seed)
     batches, places = make_batches(seen, dealt)
-    objective = Objective(loss_of(loss), *nouns)
+    objective = Objective(loss_of(loss), *_settled(nouns, dtype, cache))
     weights = [_schedule(n, w) for n, w in _weights(smoothness, smoothness_extinctions)]
     mean = jnp.mean(parameters.transfer.extinctions)
     unit = jnp.where(mean > 0, mean, 1).astype(dtype)
@@ -217,6 +218,13 @@ def fit(
         "held_out": likeness(others, unseen.split(unseen.targets)) if others else [],
     }
     return FitResult(fitted, result.loss_history, images, others, result.stopped, numbers)
+
+
+def _settled(nouns: Any, dtype: Any, cache: bool) -> tuple[Any, ...]:
+    """The nouns, with the loops that serve decided on before anything is compiled."""
+    integrator, compositor, adjoint, tracer = nouns
+    pipeline = Pipeline(Recorded() if cache else tracer, integrator, compositor)
+    return integrator, compositor, settle(adjoint, pipeline, dtype), tracer
 
 
 @dataclasses.dataclass(frozen=True)

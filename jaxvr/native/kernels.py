@@ -16,7 +16,7 @@ from jaxvr.composite.over import Over, OverState
 from jaxvr.native.build import target_name
 from jaxvr.numerics.rules import Rule, rule_for, thin_rule
 from jaxvr.optics.analytic import RULES
-from jaxvr.optics.partition import JUMP_WIDTH, Nodes
+from jaxvr.optics.partition import Nodes
 from jaxvr.trace.raycast import CastScene
 from jaxvr.trace.recorded import Nodes as Recording
 from jaxvr.trace.recorded import Runs
@@ -158,7 +158,7 @@ def _rows(rule: Rule) -> np.ndarray:
 
 
 def slabs_of(table: Nodes) -> Array:
-    """A record for each of K + 1 slabs (K + 1, 15): see src/slab.h."""
+    """A record for each of K + 1 slabs (K + 1, 16): see src/slab.h."""
     position = lax.stop_gradient(table.position)
     count, dtype = position.shape[0], position.dtype
     infinite = jnp.full(1, jnp.inf, dtype)
@@ -166,14 +166,18 @@ def slabs_of(table: Nodes) -> Array:
     left, right = np.maximum(slab - 1, 0), np.minimum(slab, count - 1)
     low, high = position[left], position[right]
     outermost = (slab == 0) | (slab == count)
-    jump = (high - low < JUMP_WIDTH) & ~outermost
-    width = jnp.where(jump | outermost, JUMP_WIDTH, high - low)
+    # Border k is position k; the two of a jump are hard on all sides.
+    equal = position[1:] == position[:-1]
+    hard = jnp.zeros(count, dtype).at[:-1].max(equal).at[1:].max(equal)
+    no = jnp.zeros(1, dtype)
+    inside = (low < high) & ~outermost
+    slope = jnp.where(inside, 1 / jnp.where(inside, high - low, 1), 0)
     first, second = table.optical[:, left], table.optical[:, right]
     floor, ceiling = jnp.concatenate([-infinite, position]), jnp.concatenate([position, infinite])
     dark = (first[0] == 0) & (second[0] == 0)
     dark_range = (jnp.where(dark, floor, jnp.inf), jnp.where(dark, ceiling, -jnp.inf))
     columns = [
-        *(floor, ceiling, low, jnp.where(outermost, 0, 1 / width), *first, *(second - first)),
-        *(jump.astype(dtype), *dark_range),
+        *(floor, ceiling, low, slope, *first, *(second - first)),
+        *(jnp.concatenate([no, hard]), jnp.concatenate([hard, no]), *dark_range),
     ]
     return jnp.stack(columns, 1)

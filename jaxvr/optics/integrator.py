@@ -147,8 +147,6 @@ class AbstractSlabIntegrator(AbstractIntegrator):
 
     def start(self, table, scalar):
         scalar = jax.lax.stop_gradient(scalar)
-        if table.texture is not None:  # found there, at each step
-            return Cursor(scalar, jnp.zeros(scalar.shape, jnp.int32))
         return Cursor(scalar, locate(table.position, scalar))
 
     def step(self, table, segment, cursor):

@@ -6,9 +6,9 @@ closed integral. The K control points x_0 <= ... <= x_{K-1} make K + 1 slabs: sl
 handles one piece, as in Espinha and Celes 2005, Figure 6: a `Cursor` remembers where in its
 segment each ray stands, and moves to the neighbouring slab when the piece ends there.
 
-Two control points at one position are a slab of no width, a jump. A ray that crosses it gets a
-piece of no length there, which contributes nothing but the derivative with respect to where the
-jump is.
+Two control points at one position are a slab of no width, a jump; nothing else is one, however near
+two points are. A ray that crosses it gets a piece of no length there, which contributes nothing but
+a derivative.
 
 A slab is transparent if the extinction at both of its control points is 0. A run of adjacent
 transparent slabs contributes nothing wherever it is cut, so `merge_transparent` takes the control
@@ -16,12 +16,33 @@ points inside of it away, and a segment passes the run in one piece. The image i
 are derivatives with respect to segments. Those with respect to the transfer function are not: a
 control point of extinction 0 that has been taken away has a derivative all the same.
 
-Derivatives hold the partition fixed: the integrand is continuous across the ends of a piece, so
-the terms from moving ends cancel between neighbours (Leibniz), and no division by the difference
-of the end scalars is left. First derivatives of whole segments are exact, second ones are not.
-At kinks (a scalar that stays exactly at a control point) the derivative is the one through the
-slab that the value was taken from. Where a segment starts or ends exactly at a jump, the jump's
-own derivative is counted only if the segment goes through.
+A soft cut is held, a hard cut moves. At a control point where the transfer function is continuous
+the terms from moving ends of pieces cancel between neighbours (Leibniz), so its place is held, and
+no division by the difference of the end scalars is left. At a jump the integrand jumps, and the
+place is differentiated. With a segment from s_f to s_b, along which s(t) = (1 - t) s_f + t s_b, a
+border at the position p is met at t = (p - s_f) / (s_b - s_f), so that
+
+    m  =  (1 - t) ds_f + t ds_b - dp
+
+says how far the scalar at the border has run ahead of it, and
+
+    soft:   the place in the slab, at fixed t, changes by m / width; the piece's share of the
+            segment not at all
+    hard:   the place in the slab stays at the border; t changes by -m / (s_b - s_f), and with it
+            the share of the pieces on both sides.
+
+The two equal positions of a jump are the ends of three pieces: the lower one of that before it
+(below), the upper one of that behind it, both of the piece of no length between them, which has the
+lower side's values at one end and the upper side's at the other. So moved together they move the
+jump, and moved apart they make a ramp: the derivative by each of the two is the one-sided one, in
+the only direction in which they may go apart, and their sum is that of the jump.
+
+First derivatives of whole segments are exact, second ones are not. At kinks (a scalar that stays
+exactly at a control point) the derivative is the one through the slab that the value was taken
+from. A scalar exactly at a jump belongs to the upper side, as in tf(s), at the ends of a segment as
+well: a segment crosses the jump at p if its lower end is below p and its upper end is at p or
+above. So where an end lies exactly on a jump, as where a face of the mesh is an isosurface of it,
+the derivative is the one-sided one for the jump moving down, or the field moving up.
 """
 
 from __future__ import annotations
@@ -38,10 +59,6 @@ from jaxvr.optics.transfer import TransferFunction
 
 Array = jax.Array
 _hold = lax.stop_gradient
-
-# The width given to a jump, so that slope times width is its height. Anything far below the
-# rounding of a scalar does; its square must not underflow in float32.
-JUMP_WIDTH = 1e-20
 
 
 class Segment(NamedTuple):
@@ -89,7 +106,10 @@ class Piece(NamedTuple):
     left, right (R,) int32: the slab's control points; the same one in the two outermost slabs.
     t (2, R): where the piece starts and ends, as fractions of the segment.
     place (2, R): the same ends as fractions of the slab, 0 at `left`.
-    fraction (R,): its share of the segment's length. width (R,): of the slab.
+    fraction (R,): its share of the segment's length.
+    slope (2, R): at a soft end 1 / width of the slab, 0 outside the control points; at a hard end 0.
+    rate (2, R): at a hard end, what its fraction loses for each unit by which the scalar runs ahead
+    of the border there, 1 / (s_b - s_f) at the piece's end and minus that at its start; else 0.
     """
 
     left: Array
@@ -97,7 +117,8 @@ class Piece(NamedTuple):
     t: Array
     place: Array
     fraction: Array
-    width: Array
+    slope: Array
+    rate: Array
 
 
 def nodes_of(transfer: TransferFunction, dtype: Any) -> Nodes:
@@ -197,11 +218,18 @@ def cut(nodes: Nodes, segment: Segment, cursor: Cursor) -> tuple[Piece, Cursor, 
     """
     count = nodes.position.shape[0]
     front, back, (scalar, slab) = _hold(segment.front), _hold(segment.back), cursor
+    position = _hold(nodes.position)
     left, right = jnp.maximum(slab - 1, 0), jnp.minimum(slab, count - 1)
-    low, high = _hold(nodes.position)[left], _hold(nodes.position)[right]
-    outermost = (slab == 0) | (slab == count)
-    floor = jnp.where(slab == 0, -jnp.inf, low)
-    ceiling = jnp.where(slab == count, jnp.inf, high)
+    low, high = position[left], position[right]
+    first, last = slab == 0, slab == count
+    outermost = first | last
+    floor = jnp.where(first, -jnp.inf, low)
+    ceiling = jnp.where(last, jnp.inf, high)
+    # Whether a border is one of the two equal positions of a jump.
+    jump = (low == high) & ~outermost
+    hard_floor = jump | ((slab >= 2) & (position[jnp.maximum(left - 1, 0)] == low))
+    above_high = position[jnp.minimum(right + 1, count - 1)]
+    hard_ceiling = jump | ((slab <= count - 2) & (above_high == high))
 
     change = back - front
     up, flat = change > 0, change == 0
@@ -210,27 +238,32 @@ def cut(nodes: Nodes, segment: Segment, cursor: Cursor) -> tuple[Piece, Cursor, 
     below = scalar < floor
     astray = above | below
     end = jnp.where(up, jnp.minimum(back, ceiling), jnp.maximum(back, floor))
-    onward = (jnp.where(up, back > ceiling, back < floor) & ~flat) | astray
+    # To end at a jump from below is to go through it.
+    rises = (back > ceiling) | (hard_ceiling & (back == ceiling))
+    onward = (jnp.where(up, rises, back < floor) & ~flat) | astray
     upward = jnp.where(astray, above, up)
 
     per_scalar = 1 / jnp.where(flat, 1, change)
-    jump = (high - low < JUMP_WIDTH) & ~outermost
     fraction = jnp.where(flat, 1.0, (end - scalar) * per_scalar)
-    fraction = jnp.where(jump, JUMP_WIDTH * jnp.abs(per_scalar), fraction)
-    fraction = jnp.where(astray, 0.0, fraction)
-    width = jnp.where(jump | outermost, JUMP_WIDTH, high - low)
-    slope = jnp.where(outermost | astray, 0.0, 1 / width)
+    fraction = jnp.where(astray | jump, 0.0, fraction)
+    inside = ~(outermost | jump | astray)
+    slope = jnp.where(inside, 1 / jnp.where(inside, high - low, 1), 0.0)
 
     def place(at: Array, in_jump: Array) -> Array:
         return jnp.where(jump, in_jump.astype(at.dtype), (at - low) * slope)
 
+    # A segment that starts at a jump comes from its upper side: upwards it has not crossed it.
+    from_below = hard_floor & (scalar == floor) & (scalar != front)
+    hard_start = jnp.where(up, from_below, hard_ceiling & (scalar == ceiling)) & ~(flat | astray)
+    hard_end = jnp.where(up, hard_ceiling, hard_floor) & onward & ~astray
     piece = Piece(
         left,
         right,
         jnp.stack([(scalar - front) * per_scalar, jnp.where(flat, 1, (end - front) * per_scalar)]),
         jnp.stack([place(scalar, ~up), place(end, up)]),
         fraction,
-        width,
+        jnp.stack([jnp.where(hard_start, 0, slope), jnp.where(hard_end, 0, slope)]),
+        jnp.stack([jnp.where(hard_start, -per_scalar, 0), jnp.where(hard_end, per_scalar, 0)]),
     )
     moved = jnp.where(onward, jnp.where(upward, 1, -1), 0)
     cursor = Cursor(jnp.where(astray, scalar, end), slab + moved.astype(jnp.int32))
@@ -268,26 +301,27 @@ class Ends(NamedTuple):
 
 
 @jax.custom_jvp
-def _place(place, t, width, front, back, position):
-    return place
+def _moving(place, fraction, t, slope, rate, front, back, position):
+    return place, fraction
 
 
-@_place.defjvp
-def _place_jvp(primals, tangents):
-    # place = (s(t) - x_left) / (x_right - x_left) at fixed t: it changes by
-    # [(1 - t) ds_front + t ds_back - (1 - place) dx_left - place dx_right] / width.
-    place, t, width, _, _, _ = primals
-    _, _, _, d_front, d_back, d_position = tangents
-    moved = (1 - t) * d_front[None] + t * d_back[None]
-    moved = moved - (1 - place) * d_position[:1] - place * d_position[1:]
-    return place, moved / width[None]
+@_moving.defjvp
+def _moving_jvp(primals, tangents):
+    # m of the module's text, at both ends of the piece.
+    place, fraction, t, slope, rate, *_ = primals
+    *_, d_front, d_back, d_position = tangents
+    ahead = (1 - t) * d_front[None] + t * d_back[None]
+    ahead = ahead - (1 - place) * d_position[:1] - place * d_position[1:]
+    return (place, fraction), (ahead * slope, -jnp.sum(ahead * rate, 0))
 
 
 def ends(piece: Piece, segment: Segment, slabs: Slabs) -> Ends:
-    """Extinction and colour at the ends of a piece, differentiable with the partition fixed."""
-    place = _place(
-        *(piece.place, piece.t, piece.width, segment.front, segment.back, slabs.position)
+    """Extinction and colour at the ends of a piece, and its length: differentiable with soft cuts
+    held and hard cuts moving."""
+    place, fraction = _moving(
+        *(piece.place, piece.fraction, piece.t, piece.slope, piece.rate),
+        *(segment.front, segment.back, slabs.position),
     )
     left, right = slabs.optical
     front, back = (left + p[None] * (right - left) for p in place)
-    return Ends(front, back, segment.length * piece.fraction)
+    return Ends(front, back, segment.length * fraction)

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxvr._core.once import once
 from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment
 from jaxvr.trace.face import (
@@ -98,17 +99,60 @@ def in_order(three: Any, place: Array) -> Any:
     return choose(front, d, p), choose(front, p, choose(back, q, d)), choose(back, d, q)
 
 
-def make_segment(depth, front: Array, out, turned: Array, stretch: Array):
-    """From the entry depth and scalar to the exit, with what lies behind the eye cut off.
+# Depths of the scene, whose coordinates are below 1, that are this close may differ by rounding: a
+# few units in the last place of coordinates.
+_ROUNDING = 16
 
-    A depth that rounding puts before the entry counts as the entry, so that chords add up to the
-    distance from the first face to the last. In a turned cell depth runs backwards.
+
+@jax.custom_jvp
+def _moving_as(x: Array, other: Array) -> Array:
+    """x, with the derivative of `other`."""
+    return x
+
+
+@_moving_as.defjvp
+def _moving_as_jvp(primals, tangents):
+    return primals[0], tangents[1]
+
+
+class Reached(NamedTuple):
+    """How far a ray has come: depth (2, R), a pair, and by how much that is farther (R,) than the
+    face it stands in; 0 unless that face lies farther back than rounding explains."""
+
+    depth: Array
+    lead: Array
+
+
+def make_segment(reached: Reached, front: Array, out: Crossing, turned: Array, stretch: Array):
+    """The segment from where a ray has come to up to the exit, with what lies behind the eye cut
+    off, and how far the ray has come then. front (R,): the scalar at the entry face.
+
+    An exit before the depth reached ends a segment of no length: the ray stays where it is, so that
+    chords add up to the distance from the first face to the last. The next segment then starts
+    there as well, and no longer at its own entry: its scalar has moved along its chord. In a turned
+    cell all that runs backwards.
+
+    Derivatives telescope as chords do. Where the exit lies behind by no more than rounding, as that
+    of a cell without volume may, the depth reached is its, and the length of 0 has the derivative
+    of a cell that has volume: of the two sides of that kink it is the one taken, whatever rounding
+    made of the cell. Where a cell is overturned for good, the depth reached is still that of an
+    earlier face, and moves with it.
     """
+    depth, lead = reached
     advance = (out.z - depth[0]) + (out.z_low - depth[1])
-    proper = jnp.where(turned, advance < 0, advance > 0)
-    end = jnp.where(proper[None], jnp.stack([out.z, out.z_low]), depth)
-    chord = jnp.where(proper, jnp.where(turned, -advance, advance), 0.0)
-    return _clip_at_eye(depth, end, front, out.value, chord, stretch), end
+    ahead = jnp.where(turned, -advance, advance)
+    proper = ahead > 0
+    near = ahead > -_ROUNDING * jnp.finfo(ahead.dtype).eps
+    exit_depth = jnp.stack([out.z, out.z_low])
+    end = _moving_as(jnp.where(proper[None], exit_depth, depth), exit_depth)
+    end = jnp.where(near[None], end, depth)
+    chord = jnp.where(near, _moving_as(jnp.maximum(ahead, 0), ahead), 0)
+    cut = proper & (lead != 0)
+    whole = jnp.where(cut, lead + advance, 1)
+    share = jnp.clip(jnp.where(cut, lead, 0) / jnp.where(whole == 0, 1, whole), 0, 1)
+    front = jnp.where(cut, front + (out.value - front) * share, front)
+    after = Reached(end, jnp.where(near, 0, -advance))
+    return _clip_at_eye(depth, end, front, out.value, chord, stretch), after
 
 
 def _clip_at_eye(start, end, front: Array, back: Array, chord: Array, stretch: Array) -> Segment:
@@ -197,9 +241,9 @@ def as_rays(rays: ShearedRays, gradient: Any) -> ShearedRays:
 
 def segment_between(near: Crossing, far: Crossing, stretch: Array) -> Segment:
     """The segment between two crossings, of which `far` is not the nearer one."""
-    depth = jnp.stack([near.z, near.z_low])
+    reached = Reached(jnp.stack([near.z, near.z_low]), jnp.zeros_like(near.z))
     no = jnp.zeros(stretch.shape, bool)
-    return make_segment(depth, near.value, far, no, stretch)[0]
+    return make_segment(reached, near.value, far, no, stretch)[0]
 
 
 def pull_back_cell(
@@ -214,16 +258,23 @@ def pull_back_cell(
     share, enter = stage(wanted, _crossed, cell.face, cell.weights, rays.eye)
     exit_share, leave = stage(wanted, _crossed, ahead.face, ahead.weights, rays.eye)
 
-    def pull_back_segment(enter: Crossing, leave: Crossing, stretch: Array, bar: Segment):
-        def forward(enter, leave, stretch):
-            depth = jnp.stack([enter.z, enter.z_low])
-            return make_segment(depth, enter.value, leave, turned, stretch)[0]
+    # The depth reached is that of the entry face, or of one farther on that was left behind.
+    cut = live & (cell.lead != 0)
+    before = jnp.where(cut, cell.reached, cell.word)
+    start = once(jnp.any(cut), _start_at, enter, scene, rays, before, cut)
 
-        return jax.vjp(forward, enter, leave, stretch)[1](bar)
+    def pull_back_segment(enter, start, leave, stretch, bar):
+        def forward(enter, start, leave, stretch):
+            start = choose(cut, start, enter)
+            lead = jnp.where(cut, (start.z - enter.z) + (start.z_low - enter.z_low), 0)
+            reached = Reached(jnp.stack([start.z, start.z_low]), lead)
+            return make_segment(reached, enter.value, leave, turned, stretch)[0]
+
+        return jax.vjp(forward, enter, start, leave, stretch)[1](bar)
 
     cotangent = Segment(*(jnp.where(live, g, 0) for g in cotangent))
-    enter_bar, leave_bar, stretch_bar = stage(
-        wanted, pull_back_segment, enter, leave, rays.stretch, cotangent
+    enter_bar, start_bar, leave_bar, stretch_bar = stage(
+        wanted, pull_back_segment, enter, start, leave, rays.stretch, cotangent
     )
     area, exit_area = sum_of(cell.weights), sum_of(ahead.weights)
     area = jnp.where(cell.positive, area, -area)
@@ -243,7 +294,27 @@ def pull_back_cell(
 
     if coordinates is not None:
         coordinates = _to_points(coordinates, rays, ids, shares, q, p)
-    return (values, coordinates), _to_rays(by_rays, rays, (q, enter), (p, leave), stretch_bar)
+    by_rays = _to_rays(by_rays, rays, (q, enter), (p, leave), stretch_bar)
+    moved = (coordinates, by_rays)
+    moved = once(jnp.any(cut), _pull_back_start, moved, scene, rays, before, cut, start_bar.z)
+    return (values, moved[0]), moved[1]
+
+
+def _start_at(enter: Crossing, scene: Scene, rays: ShearedRays, word: Array, cut: Array):
+    return choose(cut, crossing_of_face(scene, rays, word, jnp.ones((), bool)), enter)
+
+
+def _pull_back_start(moved: Any, scene: Scene, rays: ShearedRays, word: Array, cut: Array, z_bar):
+    """Adds what a cotangent z_bar (R,) of the depth of faces is to points and rays that are cut."""
+    coordinates, by_rays = moved
+    zero = jnp.zeros_like(z_bar)
+    end = _end(scene, rays, word, jnp.ones((), bool))
+    q = _pull_back_crossing(end.face, end.area, jnp.where(cut, z_bar, 0), zero)
+    none = _Pulled(zero, zero, zero, zero)
+    if coordinates is not None:
+        shares = [(share, zero) for share in end.share]
+        coordinates = _to_points(coordinates, rays, end.ids, shares, q, none)
+    return coordinates, _to_rays(by_rays, rays, (q, end.at), (none, end.at), zero)
 
 
 def _in_space(rays: ShearedRays, v: _Pulled) -> tuple[Array, Array, Array]:

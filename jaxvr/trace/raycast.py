@@ -42,6 +42,7 @@ from jaxvr.trace.base import AbstractTracer
 from jaxvr.trace.entry import Boxes, Entries, build_boxes, no_entries, search
 from jaxvr.trace.face import Face, choose, crossing, is_positive, opposite_edges, sizes_of
 from jaxvr.trace.local import (
+    Reached,
     as_rays,
     as_scene,
     edges_to_apex,
@@ -80,7 +81,7 @@ class Cell(NamedTuple):
 
     word (R,): packed cell and local index of the apex. positive (R,): sign of the entry face.
     face: its three vertices (4, R). weights (3, R): their barycentric weights. exit_corner (R,):
-    local index of the vertex that the exit face does not have.
+    local index of the vertex that the exit face does not have. lead, reached: as they were ahead.
     """
 
     word: Array
@@ -88,6 +89,8 @@ class Cell(NamedTuple):
     face: Face
     weights: Array
     exit_corner: Array
+    lead: Array
+    reached: Array
 
 
 class Ahead(NamedTuple):
@@ -95,7 +98,9 @@ class Ahead(NamedTuple):
 
     word (R,): packed cell behind it and local index of the apex there, -1 outside of the mesh.
     positive (R,), face, weights (3, R): its sign, vertices and weights, as in a `Cell`.
-    depth (2, R), a pair, and value (R,): where the ray crosses it.
+    depth (2, R), a pair: where the ray crosses it, or how far it has come, if that is farther by
+    lead (R,), see `local.Reached`; then reached (R,) is the word of the face where that was.
+    value (R,): the scalar where the ray crosses it.
     """
 
     word: Array
@@ -104,6 +109,8 @@ class Ahead(NamedTuple):
     weights: Array
     depth: Array
     value: Array
+    lead: Array
+    reached: Array
 
 
 class CastState(NamedTuple):
@@ -156,8 +163,10 @@ class RayCast(AbstractTracer):
         vertex = jnp.zeros((4, count), dtype)
         face, ones = (vertex, vertex, vertex), jnp.ones((3, count), dtype)
         return CastState(
-            cell=Cell(integer, no, face, ones, integer),
-            ahead=Ahead(integer, no, face, ones, jnp.zeros((2, count), dtype), zero),
+            cell=Cell(integer, no, face, ones, integer, zero, integer),
+            ahead=Ahead(
+                *(integer, no, face, ones, jnp.zeros((2, count), dtype), zero, zero, integer)
+            ),
             segment=Segment(zero, zero, zero),
             active=no,
             waiting=~no,
@@ -241,7 +250,8 @@ def _enter(door: _Door, scene: CastScene, rays: ShearedRays) -> _Door:
     sizes = sizes_of(edges)
     at = stage(wanted, crossing, face, sizes, rays.eye)
     word = packing.pack(cell, corner, packing.turned_of(word))
-    new = Ahead(word, is_positive(edges[2]), face, sizes, jnp.stack(at[:2]), at.value)
+    none = jnp.zeros_like(at.z)
+    new = Ahead(word, is_positive(edges[2]), face, sizes, jnp.stack(at[:2]), at.value, none, word)
     ahead = choose(entering, new, door.ahead)
     return _Door(ahead, entering, jnp.zeros_like(entering), entries, last)
 
@@ -286,9 +296,10 @@ def _cross(
     )
     out = stage(wanted, crossing, new_face, new_weights, rays.eye)
     turned = packing.turned_of(word) == 1
-    segment, depth = stage(wanted, make_segment, ahead.depth, front, out, turned, rays.stretch)
+    reached = Reached(ahead.depth, ahead.lead)
+    segment, reached = stage(wanted, make_segment, reached, front, out, turned, rays.stretch)
     lost = moved & leave.lost
-    cell = Cell(word, ahead.positive, face, ahead.weights, exit_corner)
+    cell = Cell(word, ahead.positive, face, ahead.weights, exit_corner, ahead.lead, ahead.reached)
     active = jnp.where(moved, ~lost, state.active)
     segment = choose(moved, segment, state.segment)
     return CastState(
@@ -298,8 +309,10 @@ def _cross(
             positive,
             new_face,
             new_weights,
-            choose(moved, depth, ahead.depth),
+            choose(moved, reached.depth, ahead.depth),
             jnp.where(moved, segment.back, ahead.value),
+            jnp.where(moved, reached.lead, ahead.lead),
+            jnp.where(moved & (ahead.lead == 0), word, ahead.reached),
         ),
         segment=segment._replace(length=jnp.where(active, segment.length, 0)),
         active=active,

@@ -31,6 +31,7 @@ from jaxvr._core.checks import (
     require_shape,
 )
 from jaxvr._core.pytree import pytree, static
+from jaxvr._core.stage import stage
 
 Array = jax.Array
 
@@ -239,12 +240,21 @@ class Camera:
         return right, jnp.cross(right, forward), forward
 
     def rays(self) -> tuple[Array, Array]:
-        """Origins and unit directions (height, width, 3), (height, width, 3), one ray a pixel."""
+        """Origins and unit directions (height, width, 3), (height, width, 3), one ray a pixel.
+
+        The same bits inside of any `jit` and outside: what XLA fuses decides which products and
+        sums are rounded once, so rays are made in kernels of their own (see `_core.stage`). Those
+        of a camera whose eye is NaN have no direction, and are told as lost.
+        """
         return _rays(self)
 
 
 @jax.jit
 def _rays(camera: Camera) -> tuple[Array, Array]:
+    return stage(jnp.all(camera.eye == camera.eye), _make_rays, camera)
+
+
+def _make_rays(camera: Camera) -> tuple[Array, Array]:
     w, h, dtype = camera.width, camera.height, camera.dtype
     if camera.fov is not None:
         half = jnp.tan(jnp.deg2rad(camera.fov) / 2)

@@ -1,8 +1,13 @@
 """From points, cells and values as people have them to the arrays of a `TetMesh` (all NumPy).
 
 The steps, each a function below or in a file beside this one: name the cell types (`cells`), check
-the indices, weld, subdivide, drop what has no volume, turn what is inverted, sort each row by
+the indices, weld, subdivide, drop what repeats a point, turn what is inverted, sort each row by
 welded id, match the faces, find the fold bits, and put the boundary in order.
+
+Cells without volume stay. A face is shared by two cells or bounds the mesh, so without a flat cell
+the faces beside it would bound the mesh inside of it: a crack, whose two sides a ray may or may not
+cross both, and a hole once the points move. Which cells are flat `geometry.flat_cells` says; their
+corners do not tell which way round they lie, and their neighbours do (`connectivity.fill_signs`).
 """
 
 from __future__ import annotations
@@ -17,7 +22,7 @@ import numpy as np
 from .._core.checks import as_floats, default_float, float_dtype, is_concrete, require_finite
 from . import cells as zoo
 from . import connectivity as conn
-from .geometry import signed_volumes
+from .geometry import flat_cells, signed_volumes
 from .packing import MAX_CELLS
 from .report import MeshReport, collapse
 from .weld import weld
@@ -31,6 +36,11 @@ _TWISTED = 0.05
 # Six volumes of a cell, as a part of its longest edge cubed, above which it is no sliver of
 # rounding.
 _SOLID = 1e-6
+# The same for a cell that lies the wrong way round among its neighbours: half the digits of
+# float64, in which meshes are made. Generators compare squares of lengths (circumspheres of nearly
+# cospherical points), which tell lengths to the root of the rounding only; so a fold lower than
+# that is theirs. Qhull returns some on lattices jittered by 1e-12, about 1e-11 high.
+_RESOLVED = 2.0**-26
 # Cells on which other orders are tried.
 _SAMPLE = 1000
 
@@ -189,14 +199,15 @@ def _cut(
     pts: np.ndarray, welded: np.ndarray, kind: zoo.CellKind, corners: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Cells as tetrahedra (T, 4), their parents (T,), volumes times six (T,) and signs (T,), which
-    are 0 for those without volume and those that repeat a point."""
+    are 0 for those without volume, as those that repeat a point."""
     t, p = zoo.subdivide(kind, corners, welded)
-    ids = welded[t]
-    volume, s = signed_volumes(pts, t)
-    for i in range(4):
-        for j in range(i):
-            s[ids[:, i] == ids[:, j]] = 0
-    return t, p, volume, s
+    return t, p, *signed_volumes(pts, t)
+
+
+def _repeats(welded: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """Which tetrahedra (T,) bool have a point twice, by welded ids."""
+    ids = welded[tets]
+    return np.any([ids[:, i] == ids[:, j] for i in range(4) for j in range(i)], axis=0)
 
 
 def _twisted(
@@ -244,10 +255,25 @@ def _collapsed(given: Any, pts: np.ndarray, tets: np.ndarray) -> int:
     if pts.dtype == np.float64 or np.array_equal(exact, pts):
         return 0
     volume, _ = signed_volumes(exact, tets)
-    corners = exact[tets]
+    return int((np.abs(volume) > _SOLID * _longest(exact, tets) ** 3).sum())
+
+
+def _longest(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """The longest edge of each tetrahedron (T,), in float64."""
+    corners = points[tets].astype(np.float64)
     edges = (corners[:, :, None] - corners[:, None]).reshape(len(tets), 16, 3)
-    longest = np.sqrt((edges**2).sum(-1).max(-1))
-    return int((np.abs(volume) > _SOLID * longest**3).sum())
+    return np.sqrt((edges**2).sum(-1).max(-1))
+
+
+def _match(welded_rows: np.ndarray, parent: np.ndarray, blocks: list[Block]) -> np.ndarray:
+    """`match_faces`, with an error that names the cells as they were given."""
+    try:
+        return conn.match_faces(welded_rows)
+    except conn.NonManifoldError as e:
+        names = ", ".join(dict.fromkeys(_input_name(int(parent[c]), blocks) for c in e.cells))
+        raise ValueError(
+            f"{e}, in cells {names}. A volume has at most two cells to a face: remove the others."
+        ) from None
 
 
 def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Built:
@@ -256,54 +282,63 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
     blocks, reduced, ignored = read_blocks(cells, len(pts))
     welded, duplicates = weld(pts)
 
-    tets, parent, sign, start = [], [], [], 0
+    tets, parent, sizes, sign, start = [], [], [], [], 0
     for b in blocks:
         t, p, volume, s = _cut(pts, welded, b.kind, b.corners)
         if b.kind is not zoo.TETRA:
             _require_order(pts, welded, b, _twisted(p, volume, s, len(b.corners)))
         # two node orders are in use for wedges (see cells.WEDGE); the sign of most tells which
         if b.kind is zoo.WEDGE and int(s.sum(dtype=np.int64)) < 0:
-            s = -s
+            s, volume = -s, -volume
             t = t[:, [0, 2, 1, 3]]
         tets.append(t)
         parent.append(p + start)
+        sizes.append(volume)
         sign.append(s)
         start += len(b.corners)
-    t, p, s = np.concatenate(tets), np.concatenate(parent), np.concatenate(sign)
-    made = len(t)
-    keep, collapsed = s != 0, 0
-    if not keep.all():
-        collapsed = _collapsed(points, pts, t[~keep])
-        t, p, s = t[keep], p[keep], s[keep]
-    if len(t) == 0:
+    t, p, volume, s = (np.concatenate(x) for x in (tets, parent, sizes, sign))
+    made, repeats = len(t), _repeats(welded, t)
+    flat = flat_cells(pts, t) | (s == 0)
+    collapsed = _collapsed(points, pts, t[flat | repeats]) if flat.any() or repeats.any() else 0
+    if not (s[~repeats] != 0).any():
         advice = f" {collapse(collapsed)}" if collapsed else ""
         raise ValueError(
             f"No cells left: all {made} tetrahedra are degenerate (no volume, or a repeated "
             f"point).{advice}"
         )
-    if len(t) > MAX_CELLS:
-        raise ValueError(f"The mesh has {len(t)} tetrahedra; {MAX_CELLS} is the most that fit.")
-
-    order, odd = sort_rows(t, welded)
-    rows = np.take_along_axis(t, order.astype(np.intp), 1)
-    orientation = np.where(odd, -s, s)
+    if made - int(repeats.sum()) > MAX_CELLS:
+        raise ValueError(f"The mesh has {made} tetrahedra; {MAX_CELLS} is the most that fit.")
+    keep = np.flatnonzero(~repeats)
+    order, odd = sort_rows(t[keep], welded)
+    rows = np.take_along_axis(t[keep], order.astype(np.intp), 1)
     try:
         pairs = conn.match_faces(welded[rows])
-    except conn.NonManifoldError as e:
-        names = ", ".join(dict.fromkeys(_input_name(int(p[c]), blocks) for c in e.cells))
-        raise ValueError(
-            f"{e}, in cells {names}. A volume has at most two cells to a face: remove the others."
-        ) from None
-    turned, one_sided = conn.combinatorial(orientation, pairs)
+    except conn.NonManifoldError:
+        # flat cells are kept to close cracks, not to make a mesh unreadable
+        left = ~conn.surplus(welded[rows], flat[keep])
+        keep, order, odd, rows = keep[left], order[left], odd[left], rows[left]
+        pairs = _match(welded[rows], p[keep], blocks)
+    crowded = made - int(repeats.sum()) - len(keep)
+    p, volume, flat = p[keep], volume[keep], flat[keep]
+    s = np.where(flat, 0, s[keep]).astype(np.int8)
+    swap = np.where(odd, -1, 1)
+    orientation = conn.fill_signs(swap * s, swap * volume, pairs)
+    turned, one_sided = conn.combinatorial(orientation, pairs, flat)
+    flat[turned] |= _longest(pts, rows[turned]) ** 3 * _RESOLVED >= np.abs(volume[turned])
+    # the sign of a flat cell is free, so it is never the one that lies the wrong way round
+    orientation[turned & flat] *= -1
+    turned &= ~flat
     neighbors = conn.neighbor_words(rows, pairs, turned)
     boundary = conn.boundary_words(pts, rows, neighbors, orientation, turned)
     report = MeshReport(
         input_cells=tuple((b.name, len(b.corners)) for b in blocks if len(b.corners)),
         reduced=tuple(reduced.items()),
         ignored=tuple(ignored.items()),
-        tets=len(t),
-        degenerate=made - len(t),
-        inverted=int((s < 0).sum()),
+        tets=len(rows),
+        degenerate=int(repeats.sum()),
+        crowded=crowded,
+        flat=int(flat.sum()),
+        inverted=int(((s < 0) & ~flat).sum()),
         collapsed=collapsed,
         folded=int(turned.sum()),
         seams=int(((neighbors >= 0) & ((neighbors >> 3) & 1 == 1)).sum()) // 2,

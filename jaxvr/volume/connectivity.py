@@ -5,7 +5,8 @@ order on both sides, and face k (opposite local vertex k) of a row (q0, q1, q2, 
 (-1)**k in the orientation that the row induces. Two neighbours c (face k) and n (face f) lie on
 opposite sides of the face exactly if o(c) o(n) = -(-1)**(k + f), o being the sign of a row's
 determinant. A mesh where that fails somewhere is folded; `combinatorial` finds the signs that it
-would have if it were not, which is what a walk through the cells has to go by.
+would have if it were not, which is what a walk through the cells has to go by. Cells without volume
+have no sign of their own; they get the one that fits their neighbours (`fill_signs`).
 """
 
 from __future__ import annotations
@@ -93,10 +94,74 @@ def components(n: int, pairs: np.ndarray) -> tuple[int, np.ndarray]:
     return int(count), label
 
 
-def combinatorial(sign: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, int]:
+def surplus(welded_rows: np.ndarray, flat: np.ndarray) -> np.ndarray:
+    """Flat cells (T,) bool to leave out, so that no face has three cells because of them and none
+    is given twice; of several the ones given last. flat (T,): cells without volume."""
+    drop = flat.copy()
+    _, first = np.unique(welded_rows, axis=0, return_index=True)
+    drop[first] = False
+    while True:
+        left = np.flatnonzero(~drop)
+        faces = np.concatenate([welded_rows[left][:, f] for f in FACES])
+        _, group, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+        cell = np.tile(left, 4)
+        crowded = np.flatnonzero((count[group.ravel()] > 2) & flat[cell])
+        if len(crowded) == 0:
+            return drop
+        # the last flat cell of each crowded face, and then look again
+        order = crowded[np.argsort(cell[crowded], kind="stable")]
+        last = dict(zip(group.ravel()[order].tolist(), cell[order].tolist(), strict=True))
+        drop[list(last.values())] = True
+
+
+def _implied(sign: np.ndarray, k: np.ndarray, f: np.ndarray) -> np.ndarray:
+    """The sign of a cell whose face f is face k of a cell with this sign; see the module."""
+    return np.where((k + f) % 2 == 0, -sign, sign).astype(np.int8)
+
+
+def fill_signs(sign: np.ndarray, det: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Signs (T,) int8 with those that are 0, of cells without volume, as their neighbours imply.
+
+    From cell to cell through faces, nearest first. Where no neighbour has a sign, as where all
+    cells of a component are flat, they agree with each other and with most of det (T,), whatever
+    of it may be rounding.
+    """
+    sign = sign.astype(np.int8)
+    ends = pairs[(sign[pairs[:, 0]] == 0) | (sign[pairs[:, 2]] == 0)]
+    ends = np.concatenate([ends, ends[:, [2, 3, 0, 1]]])  # from c, k to m, f
+    ends = _spread_signs(sign, ends)
+    unknown = np.flatnonzero(sign == 0)
+    if len(unknown) == 0:
+        return sign
+    number = np.full(len(sign), -1)
+    number[unknown] = np.arange(len(unknown))
+    among = np.column_stack([number[ends[:, 0]], ends[:, 1], number[ends[:, 2]], ends[:, 3]])
+    _, label = components(len(unknown), among)
+    sign[unknown[np.unique(label, return_index=True)[1]]] = 1
+    _spread_signs(sign, ends)
+    against = np.bincount(label, sign[unknown] * det[unknown]) < 0
+    sign[unknown] = np.where(against[label], -sign[unknown], sign[unknown])
+    return sign
+
+
+def _spread_signs(sign: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Fills in signs, in place, along ends (M, 4), c, k, m, f, until none is to be had; returns
+    the ends that lead to cells without."""
+    while True:
+        ends = ends[sign[ends[:, 2]] == 0]
+        now = ends[sign[ends[:, 0]] != 0]
+        if len(now) == 0:
+            return ends
+        sign[now[:, 2]] = _implied(sign[now[:, 0]], now[:, 1], now[:, 3])
+
+
+def combinatorial(
+    sign: np.ndarray, pairs: np.ndarray, flat: np.ndarray | None = None
+) -> tuple[np.ndarray, int]:
     """Which cells lie the wrong way round among their neighbours.
 
-    sign (T,): geometric orientation of each sorted row, 1 or -1; pairs from `match_faces`.
+    sign (T,): geometric orientation of each sorted row, 1 or -1; pairs from `match_faces`. flat
+    (T,) bool: cells whose sign is a guess, and has no vote.
     Returns turned (T,) bool, the cells whose geometric sign differs from the consistent one, and
     the number of components that have none (one-sided, as a Moebius band is; turned is False
     there). The overall sign of a component is that of most of its cells.
@@ -117,7 +182,8 @@ def combinatorial(sign: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, int]
     upright, other = label[:patches], label[patches:]
     one_sided = upright == other
     # each orientable component appears twice, mirrored: keep the copy with more upright cells
-    cells_upright = np.bincount(upright, np.bincount(patch, minlength=patches), minlength=count)
+    votes = np.bincount(patch, None if flat is None else ~flat, minlength=patches)
+    cells_upright = np.bincount(upright, votes, minlength=count)
     more = cells_upright[upright] - cells_upright[other]
     flip = (more < 0) | ((more == 0) & (upright > other))
     flip &= ~one_sided

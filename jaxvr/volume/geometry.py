@@ -1,4 +1,5 @@
-"""Signed volumes of tetrahedra in float64, with a bound on their rounding (NumPy, not traced)."""
+"""Signed volumes of tetrahedra in float64, with a bound on their rounding, and which of them are
+flat: volumes that the rounding of their corners may have made (NumPy, not traced)."""
 
 from __future__ import annotations
 
@@ -8,6 +9,9 @@ import numpy as np
 # (1997), orient3d: |error| <= (7 + 56 u) u * permanent, with u = 2**-53.
 _BOUND = (7.0 + 56.0 * 2.0**-53) * 2.0**-53
 _CHUNK = 1 << 19
+# Roundings that a coordinate is taken to have gone through, each of half a unit in the last place:
+# the one by which it is stored, and those of the few sums and products that made it.
+_ROUNDINGS = 4
 
 
 def signed_volumes(points: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -16,10 +20,7 @@ def signed_volumes(points: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np
     points (P, 3), tets (T, 4). Returns det (T,) float64 and sign (T,) int8, which is 0 where the
     determinant is zero to within its own rounding.
     """
-    scale = float(np.abs(points).max(initial=0.0))
-    # a power of two, exactly undone: keeps products in range for coordinates of any size
-    exponent = int(np.frexp(scale)[1]) if scale > 0 else 0
-    p = np.ldexp(np.asarray(points, np.float64), -exponent)
+    p, exponent = _scaled(points)
     det = np.empty(len(tets))
     sign = np.empty(len(tets), np.int8)
     for i in range(0, len(tets), _CHUNK):
@@ -36,3 +37,45 @@ def signed_volumes(points: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np
         det[i : i + _CHUNK], sign[i : i + _CHUNK] = d, s
     with np.errstate(over="ignore", under="ignore"):
         return np.ldexp(det, 3 * exponent), sign
+
+
+def flat_cells(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """Which tetrahedra (T,) bool have no volume beyond the rounding of their points (P, 3).
+
+    With d a bound on how far rounding may have moved any coordinate of the corners q_v, N_v twice
+    the area vector of the face opposite q_v and e the six edges, six volumes may have changed by
+
+        sum_v d |N_v|_1 + 2 d^2 sum_e |e|_1 + 24 d^3
+
+    and no more: the determinant of rows (q_v, 1) is linear in each row, and these are its terms
+    with one, two and three rows moved (with all four it is zero). d is four roundings of the
+    cell's largest coordinate, in any axis: points that were turned or sheared carry roundings of
+    the others. So a cell is flat if it is lower than a few units in the last place of where it is,
+    and which way round such a cell lies, its corners do not say. Numbers that float32 can hold are
+    taken to come from there, whatever the dtype is.
+    """
+    unit = float(np.finfo(points.dtype).eps) / 2
+    with np.errstate(over="ignore"):
+        if np.array_equal(points, points.astype(np.float32)):
+            unit = float(np.finfo(np.float32).eps) / 2
+    p, _ = _scaled(points)
+    out = np.empty(len(tets), bool)
+    for i in range(0, len(tets), _CHUNK):
+        q = p[tets[i : i + _CHUNK]]
+        d = _ROUNDINGS * unit * np.abs(q).max((1, 2))
+        a, b, c = np.moveaxis(q[:, 1:] - q[:, :1], 1, 0)
+        ab, bc, ca = b - a, c - b, a - c
+        normals = (np.cross(ab, bc), np.cross(b, c), np.cross(c, a), np.cross(a, b))
+        faces = sum(np.abs(n).sum(1) for n in normals)
+        edges = sum(np.abs(e).sum(1) for e in (a, b, c, ab, bc, ca))
+        det = np.abs((a * normals[1]).sum(1))
+        out[i : i + _CHUNK] = det <= d * (faces + d * (2 * edges + 24 * d))
+    return out
+
+
+def _scaled(points: np.ndarray) -> tuple[np.ndarray, int]:
+    """Points in float64 times 2**-exponent, exactly, and the exponent: products of coordinates of
+    any size stay in range."""
+    scale = float(np.abs(points).max(initial=0.0))
+    exponent = int(np.frexp(scale)[1]) if scale > 0 else 0
+    return np.ldexp(np.asarray(points, np.float64), -exponent), exponent

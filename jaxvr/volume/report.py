@@ -13,9 +13,11 @@ class MeshReport:
 
     input_cells: cells by type as given. reduced: those of them reduced to their corners.
     ignored: points, lines and faces among the cells, left out. degenerate, inverted: tetrahedra
-    dropped for having no volume, and given the wrong way round. collapsed: those dropped that have
-    a volume in the float64 that was given, but not in the float32 of the mesh. folded: tetrahedra
-    that lie the wrong way round among their neighbours, whichever way they are written. seams:
+    dropped for having a point twice, and given the wrong way round. flat: those kept that have no
+    volume, or none beyond the rounding of their points; crowded: those dropped, since some face
+    would have had three cells. collapsed: those without volume, kept or dropped, that have one in
+    the float64 that was given, but not in the float32 of the mesh. folded: tetrahedra that lie the
+    wrong way round among their neighbours, whichever way they are written; flat ones do not. seams:
     faces whose two cells use different but coincident points. one_sided: components without a
     consistent orientation. field: the field's name where it is known.
     """
@@ -25,6 +27,8 @@ class MeshReport:
     ignored: Counts = ()
     tets: int = 0
     degenerate: int = 0
+    crowded: int = 0
+    flat: int = 0
     inverted: int = 0
     collapsed: int = 0
     folded: int = 0
@@ -39,12 +43,14 @@ class MeshReport:
 
     def warning(self) -> str | None:
         """One sentence on what was repaired, or `None`."""
-        done = []
-        if self.degenerate:
-            done.append(f"{self.degenerate} degenerate tetrahedra (no volume) dropped")
-        if self.inverted:
-            done.append(f"{self.inverted} inverted tetrahedra turned round")
-        made = self.tets + self.degenerate
+        counts = (
+            (self.degenerate, "degenerate tetrahedra (a point twice) dropped"),
+            (self.crowded, "flat tetrahedra dropped (three to a face)"),
+            (self.flat, "flat tetrahedra (no volume) kept"),
+            (self.inverted, "inverted tetrahedra turned round"),
+        )
+        done = [f"{n} {what}" for n, what in counts if n]
+        made = self.tets + self.degenerate + self.crowded
         advice = f" {collapse(self.collapsed)}" if self.collapsed else ""
         return f"{' and '.join(done)}, of {made} in the mesh.{advice}" if done else None
 
@@ -54,7 +60,12 @@ class MeshReport:
         def listed(counts: Counts) -> str:
             return ", ".join(f"{n:,} {name}" for name, n in counts) or "unknown"
 
-        repairs = ((self.degenerate, "degenerate dropped"), (self.inverted, "inverted turned"))
+        repairs = (
+            (self.degenerate, "degenerate dropped"),
+            (self.crowded, "flat dropped"),
+            (self.flat, "flat kept"),
+            (self.inverted, "inverted turned"),
+        )
         repaired = ", ".join(f"{n:,} {what}" for n, what in repairs if n) or "nothing"
         out = [("cells given", listed(self.input_cells))]
         if self.reduced:

@@ -46,12 +46,18 @@ def test_dtypes(dtype):
     assert forced.dtype == np.dtype(other)
 
 
-def test_float64_needs_x64():
-    with jax.enable_x64(False):
-        mesh = TetMesh.from_cells(TET, {"tetra": [[0, 1, 2, 3]]}, np.arange(4))
-        assert mesh.dtype == np.float32
-        with pytest.raises(ValueError, match="jax_enable_x64"):
-            TetMesh.from_cells(TET, {"tetra": [[0, 1, 2, 3]]}, np.arange(4), dtype="float64")
+@pytest.fixture
+def without_x64():
+    jax.config.update("jax_enable_x64", False)  # jax 0.7 has no jax.enable_x64
+    yield
+    jax.config.update("jax_enable_x64", True)
+
+
+def test_float64_needs_x64(without_x64):
+    mesh = TetMesh.from_cells(TET, {"tetra": [[0, 1, 2, 3]]}, np.arange(4))
+    assert mesh.dtype == np.float32
+    with pytest.raises(ValueError, match="jax_enable_x64"):
+        TetMesh.from_cells(TET, {"tetra": [[0, 1, 2, 3]]}, np.arange(4), dtype="float64")
 
 
 def test_point_cell_and_corner_values_go_to_their_tets():

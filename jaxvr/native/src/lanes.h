@@ -8,7 +8,7 @@
 
 #define LANES 128       /* rays in a block; its rows stay in the cache */
 #define ENTRIES 8       /* entries of a ray found at a time */
-#define SLAB_NUMBERS 15 /* see slab.h */
+#define SLAB_NUMBERS 16 /* see slab.h */
 #define NODE_PAIR 10    /* position, extinction, r, g, b of a slab's lower and upper control point */
 
 enum { VX, VY, VZ, VLOW, VVALUE, VERTEX }; /* rows of a vertex, see trace/shear.py */

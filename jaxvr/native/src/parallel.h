@@ -23,11 +23,12 @@ static inline void *result(XLA_FFI_CallFrame *frame, int k) {
   return ((XLA_FFI_Buffer *)frame->rets.rets[k])->data;
 }
 
-/* Answers XLA's question which version of its interface this was compiled for. */
+/* Answers XLA's question which version of its interface this was compiled for. (The extension's
+ * type is not named: it has another name in jaxlib 0.11.1 and later.) */
 static inline int asks_metadata(XLA_FFI_CallFrame *frame) {
-  XLA_FFI_Extension_Base *extension = frame->extension_start;
-  if (!extension || extension->type != XLA_FFI_Extension_Metadata) return 0;
-  XLA_FFI_Metadata *metadata = ((XLA_FFI_Metadata_Extension *)extension)->metadata;
+  if (!frame->extension_start || frame->extension_start->type != XLA_FFI_Extension_Metadata)
+    return 0;
+  XLA_FFI_Metadata *metadata = ((XLA_FFI_Metadata_Extension *)frame->extension_start)->metadata;
   metadata->api_version.major_version = XLA_FFI_API_MAJOR;
   metadata->api_version.minor_version = XLA_FFI_API_MINOR;
   return 1;

@@ -51,12 +51,15 @@ INLINE void pull_pieces(Lanes *lanes, const Pieces *p, int m, const int dense) {
       lanes->row[TBAR + 1 + c][i] += front_bar[c] * (1 - place0) + back_bar[c] * (1 - place1);
       lanes->row[TBAR + 6 + c][i] += front_bar[c] * place0 + back_bar[c] * place1;
     }
-    move0 *= lanes->row[RECORD + SLOPE][i], move1 *= lanes->row[RECORD + SLOPE][i];
+    /* `_moving` of optics/partition.py: soft ends move in the slab, hard ones take the share along. */
+    real along = a_bar * tau_front + b_bar * tau_back, share_bar = along * lanes->row[LENGTH][i];
+    move0 = move0 * p->slope[0][j] - share_bar * p->rate[0][j];
+    move1 = move1 * p->slope[1][j] - share_bar * p->rate[1][j];
     lanes->row[TBAR][i] -= (move0 * (1 - place0) + move1 * (1 - place1));
     lanes->row[TBAR + 5][i] -= (move0 * place0 + move1 * place1);
     lanes->row[SBAR][i] += move0 * (1 - t0) + move1 * (1 - t1);
     lanes->row[SBAR + 1][i] += move0 * t0 + move1 * t1;
-    lanes->row[SBAR + 2][i] += (a_bar * tau_front + b_bar * tau_back) * p->fraction[j];
+    lanes->row[SBAR + 2][i] += along * p->fraction[j];
   }
 }
 

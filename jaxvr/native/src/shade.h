@@ -9,6 +9,7 @@
 typedef struct {
   _Alignas(64) int32_t lane[LANES], onward[LANES];
   _Alignas(64) real t[2][LANES], place[2][LANES], fraction[LANES], length[LANES];
+  _Alignas(64) real slope[2][LANES], rate[2][LANES];
   _Alignas(64) real front[4][LANES], change[4][LANES], w[LANES], w_back[LANES];
   _Alignas(64) real a[LANES], b[LANES], b0[LANES], b1[LANES], b2[LANES];
 } Pieces;
@@ -77,16 +78,18 @@ INLINE void cut_lanes(Lanes *lanes, Pieces *p, int m, const int dense, const int
     real floor = row[RECORD + FLOOR][i], ceiling = row[RECORD + CEILING][i];
     real low = row[RECORD + LOW][i];
     real difference = back - front;
-    int up = difference > 0, flat = difference == 0, jump = row[RECORD + JUMP][i] != 0;
+    int up = difference > 0, flat = difference == 0, jump = floor == ceiling;
+    int hard_floor = row[RECORD + HARD_FLOOR][i] != 0;
+    int hard_ceiling = row[RECORD + HARD_CEILING][i] != 0;
     int above = (scalar > ceiling) | (flat & (scalar == ceiling)), below = scalar < floor;
     int astray = above | below;
     real end = up ? least(back, ceiling) : most(back, floor);
-    int beyond = up ? back > ceiling : back < floor;
+    int rises = (back > ceiling) | (hard_ceiling & (back == ceiling));
+    int beyond = up ? rises : back < floor;
     int onward = (beyond & !flat) | astray, upward = astray ? above : up;
     real per_scalar = 1 / (flat ? 1 : difference);
     real fraction = flat ? 1 : (end - scalar) * per_scalar;
-    fraction = jump ? JUMP_WIDTH * ABS(per_scalar) : fraction;
-    fraction = astray ? 0 : fraction;
+    fraction = astray | jump ? 0 : fraction;
     real slope = astray ? 0 : row[RECORD + SLOPE][i];
     real place0 = jump ? (real)!up : (scalar - low) * slope;
     real place1 = jump ? (real)up : (end - low) * slope;
@@ -109,6 +112,13 @@ INLINE void cut_lanes(Lanes *lanes, Pieces *p, int m, const int dense, const int
       p->place[1][j] = place1;
       p->length[j] = length;
       p->fraction[j] = fraction;
+      int from_below = hard_floor & (scalar == floor) & (scalar != front);
+      int hard_start = (up ? from_below : hard_ceiling & (scalar == ceiling)) & !flat & !astray;
+      int hard_end = (up ? hard_ceiling : hard_floor) & onward & !astray;
+      p->slope[0][j] = hard_start ? 0 : slope;
+      p->slope[1][j] = hard_end ? 0 : slope;
+      p->rate[0][j] = hard_start ? -per_scalar : 0;
+      p->rate[1][j] = hard_end ? per_scalar : 0;
     }
   }
 }

@@ -5,8 +5,6 @@
 
 #include "lanes.h"
 
-#define JUMP_WIDTH ((real)1e-20)
-
 /* by_front, by_back, and weights times the Bernstein basis of degree 2, at each node. Rules with
  * fewer than FULL_NODES or SMALL_NODES are filled up with zeros: loops want a constant. */
 typedef struct {
@@ -24,9 +22,12 @@ typedef struct {
 
 /* Numbers of slab k of K + 1, between control points k - 1 and k (the outermost have one twice):
  * its borders, the lower control point, 1 / width (0 outside the control points), extinction, r, g,
- * b there and their change to the upper one, whether it is a jump, and its scalars if it is
- * transparent (none if not). */
-enum { FLOOR, CEILING, LOW, SLOPE, LEFT, CHANGE = LEFT + 4, JUMP = CHANGE + 4, DARK_FROM, DARK_TO };
+ * b there and their change to the upper one, whether its borders are positions of a jump (it is
+ * one itself if they are equal), and its scalars if it is transparent (none if not). */
+enum {
+  FLOOR, CEILING, LOW, SLOPE, LEFT, CHANGE = LEFT + 4, HARD_FLOOR = CHANGE + 4, HARD_CEILING,
+  DARK_FROM, DARK_TO
+};
 
 typedef struct {
   int count; /* control points */

@@ -1,0 +1,98 @@
+"""Derivatives that an adjoint cannot give: refused in words that name the one that can, and never
+computed by rules that hold for others."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvr
+from jaxvr._core.modes import constant, forward_only, reverse_only
+
+MESH = jaxvr.datasets.box((2, 1, 1), field=lambda p: p[:, 0] + 0.2 * p[:, 1], dtype="float64")
+CAMERA = jaxvr.Camera.orbit(MESH, azimuth=31, elevation=17, width=3, height=2)
+TRANSFER = jaxvr.TransferFunction([0.0, 0.4, 1.3], np.eye(3), [0.5, 2.0, 4.0])
+OPERANDS = {
+    "extinctions": lambda x, **how: jaxvr.render(
+        MESH, CAMERA, TRANSFER.replace(extinctions=x), **how
+    ),
+    "values": lambda x, **how: jaxvr.render(MESH.replace(values=x), CAMERA, TRANSFER, **how),
+}
+START = {"extinctions": TRANSFER.extinctions, "values": MESH.values}
+REPLAYS = [jaxvr.Replay(), jaxvr.Replay(native=False)]
+
+pytestmark = pytest.mark.usefixtures("quick_code")
+
+
+def loss(name, **how):
+    return lambda x: (OPERANDS[name](x, **how) ** 2).sum()
+
+
+def jvp(f):
+    return lambda x: jax.jvp(f, (x,), (jnp.ones_like(x),))[1]
+
+
+@pytest.mark.parametrize("adjoint", REPLAYS, ids=["compiled", "jax"])
+@pytest.mark.parametrize("under", [lambda f: f, jax.jit], ids=["plain", "jit"])
+@pytest.mark.parametrize("mode", [jvp, jax.jacfwd], ids=["jvp", "jacfwd"])
+def test_forward_mode_of_replay_names_forward(adjoint, under, mode):
+    f = loss("extinctions", adjoint=adjoint)
+    with pytest.raises(TypeError, match=r"adjoint=Forward\(\)"):
+        under(mode(f))(START["extinctions"])
+
+
+@pytest.mark.parametrize("under", [lambda f: f, jax.jit], ids=["plain", "jit"])
+def test_reverse_mode_of_forward_names_replay(under):
+    f = loss("values", adjoint=jaxvr.Forward())
+    with pytest.raises(TypeError, match=r"adjoint=Replay\(\)"):
+        under(jax.grad(f))(START["values"])
+
+
+@pytest.mark.parametrize("adjoint", REPLAYS, ids=["compiled", "jax"])
+@pytest.mark.parametrize("name", OPERANDS)
+@pytest.mark.parametrize("second", [jvp, lambda g: jax.grad(lambda x: g(x).sum())])
+def test_second_derivatives_of_replay_are_refused(adjoint, name, second):
+    """Forward over reverse through JAX's loops gave numbers, wrong ones."""
+    gradient = jax.grad(loss(name, adjoint=adjoint))
+    with pytest.raises(TypeError, match=r"first derivatives only.*Direct"):
+        second(gradient)(START[name])
+
+
+def test_second_derivatives_by_colours_and_extinctions_are_direct_s_and_right():
+    gradient = jax.jit(jax.grad(loss("extinctions", adjoint=jaxvr.Direct(12))))
+    x = START["extinctions"]
+    along = jnp.array([1.0, -0.5, 0.7])
+    got = jax.jvp(gradient, (x,), (along,))[1]
+    step = 1e-4
+    wanted = (gradient(x + step * along) - gradient(x - step * along)) / (2 * step)
+    np.testing.assert_allclose(got, wanted, rtol=1e-7, atol=1e-9)
+
+
+def test_modes_pass_arrays_on():
+    tree = {"a": jnp.arange(3.0), "n": jnp.arange(2)}
+    for guard in (constant, forward_only, reverse_only):
+        out = guard(tree, "no")
+        assert all(np.array_equal(out[k], tree[k]) for k in tree)
+    # The mode that is allowed, plain and through the transformations that users put round it.
+    square = lambda guard: lambda x: (guard({"x": x}, "refused")["x"] ** 2).sum()  # noqa: E731
+    x = jnp.arange(3.0)
+    for f in (square(reverse_only), jax.jit(square(reverse_only))):
+        for g in (jax.grad(f), jax.grad(jax.checkpoint(f)), jax.jit(jax.grad(f))):
+            np.testing.assert_array_equal(g(x), 2 * x)
+        np.testing.assert_array_equal(jax.vmap(jax.grad(f))(x[None]), 2 * x[None])
+        np.testing.assert_array_equal(jax.grad(lambda y: jax.vmap(f)(y).sum())(x[None])[0], 2 * x)
+    for f in (square(forward_only), jax.jit(square(forward_only))):
+        np.testing.assert_array_equal(jax.jacfwd(f)(x), 2 * x)
+        np.testing.assert_array_equal(jax.jacfwd(jax.jacfwd(f))(x), 2 * np.eye(3))
+    for refused in (
+        lambda: jax.grad(square(forward_only))(x),
+        lambda: jax.jit(jax.grad(square(forward_only)))(x),
+        lambda: jvp(square(reverse_only))(x),
+        lambda: jax.jit(jvp(square(reverse_only)))(x),
+        lambda: jax.grad(square(constant))(x),
+        lambda: jvp(square(constant))(x),
+    ):
+        with pytest.raises(TypeError, match="refused"):
+            refused()
