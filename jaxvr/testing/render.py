@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxvr._core.status import check
 from jaxvr.render import render, render_rays
 from jaxvr.testing.brute import AROUND, BruteForce
 from jaxvr.view import Camera
@@ -95,16 +96,20 @@ def assert_render_close(
 
     Raises:
       AssertionError: says how many pixels are off, which is the worst, by how much, its ray, and
-        how many cells that crosses.
+        how many cells that crosses. RenderError: if a ray could not be followed.
     """
     dtype = np.dtype(volume.points.dtype).name
     atol = ATOL[dtype] if atol is None else atol
     slack = SLACK[dtype] if slack is None else slack
     if image is None:
         if isinstance(camera, Camera):
-            image = render(volume, camera, transfer, background=background, **how)
+            found = render(volume, camera, transfer, background=background, status=True, **how)
         else:
-            image = render_rays(volume, *camera, transfer, background=background, **how)
+            found = render_rays(
+                *(volume, *camera, transfer), background=background, status=True, **how
+            )
+        image, status = found  # asked for, so that odd views, which are meant, give no warning
+        check(status)
     origins, directions = _rays(camera)
     shape = origins.shape[:-1]
     found = np.asarray(image, np.float64)
