@@ -18,6 +18,7 @@ import time
 import traceback
 import warnings
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -39,7 +40,7 @@ def explore(minutes: float, seed: int, steps: int = 25) -> tuple[dict[str, int],
         deadline=None,
         database=None,
         phases=[hypothesis.Phase.generate],
-        suppress_health_check=list(hypothesis.HealthCheck),
+        suppress_health_check=[*hypothesis.HealthCheck],  # pyright: ignore[reportArgumentType]
         print_blob=True,
     )
     try:
@@ -63,7 +64,7 @@ def all_orders(sequences: int, run: bool, engines: list[bool | None], dtypes: li
     for native in engines:
         for dtype in dtypes:
             scene = orders.Scene(dtype, native)
-            how = scene.run if run else scene.trace
+            how: Any = scene.run if run else scene.trace
             alone = orders.alone(how)
             programs = [*orders.pairs(), *orders.sequences(sequences)]
             for number, program in enumerate(programs):

@@ -132,9 +132,14 @@ def _probed(scene: Scene) -> list[Any]:
     return [found.start, found.distances, found.scalars, found.contributions]
 
 
+def _rays(scene: Scene) -> list[Any]:
+    origins, directions = scene.camera.rays()
+    return [jaxvr.render_rays(scene.mesh, origins, directions, scene.transfer, **scene.how)]
+
+
 VERBS: dict[str, Any] = {
     "render": lambda s: [s.image()],
-    "render_rays": lambda s: [jaxvr.render_rays(s.mesh, *s.camera.rays(), s.transfer, **s.how)],
+    "render_rays": _rays,
     "shade": lambda s: [s.shaded(s.segments())],
     "probe": _probed,
     "measure_k": lambda s: [np.asarray(jaxvr.measure_k(s.mesh, s.camera).k)],

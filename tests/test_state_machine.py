@@ -27,7 +27,7 @@ def test_verbs_in_any_order(worker):
         derandomize=True,
         database=None,
         phases=[hypothesis.Phase.generate],
-        suppress_health_check=list(hypothesis.HealthCheck),
+        suppress_health_check=[*hypothesis.HealthCheck],  # pyright: ignore[reportArgumentType]
     )
     count: dict[str, int] = {}
     run_state_machine_as_test(make_machine(worker, count=count), settings=settings)

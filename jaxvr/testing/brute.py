@@ -107,7 +107,8 @@ class BruteForce:
             self.levels.append((low, high))
 
     def candidates(self, origins: np.ndarray, directions: np.ndarray):
-        """Pairs (ray, cell) whose boxes meet; all that matter and some more."""
+        """Pairs (ray, cell) of rays (origins and directions, (R, 3)) and cells whose boxes meet;
+        all that matter and some more."""
         inverse = 1 / np.where(np.abs(directions) < 1e-200, 1e-200, directions)
         low, high = self.levels[-1]
         ray = np.repeat(np.arange(len(origins)), len(low))
@@ -131,7 +132,7 @@ class BruteForce:
         return ray[self.solid[cell]], cell[self.solid[cell]]
 
     def pieces(self, origins: Any, directions: Any, shift: Any = None) -> Pieces:
-        """Chords of rays (R, 3); depths are world lengths from the origin.
+        """Chords of rays, origins and directions (R, 3); depths are world lengths from the origin.
 
         shift: how far rays are moved, in diagonals: a number, or a vector (3,).
         """
@@ -180,7 +181,8 @@ class BruteForce:
     def lengths(
         self, origins: Any, directions: Any, chunk: int = 64, shift: Any = None
     ) -> np.ndarray:
-        """The total chord (R,) of rays (R, 3)."""
+        """The total chord (R,) of rays, origins and directions (R, 3). chunk: rays at once; shift:
+        as for `pieces`."""
         parts = [slice(i, i + chunk) for i in range(0, len(origins), chunk)]
         traced = (self.pieces(origins[p], directions[p], shift) for p in parts)
         sums = [chords(t, len(origins[p])) for t, p in zip(traced, parts, strict=True)]
@@ -194,7 +196,8 @@ class BruteForce:
         chunk: int = 64,
         shift: Any = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """rgba (R, 4), premultiplied, and the total chord (R,) of rays (R, 3)."""
+        """rgba (R, 4), premultiplied, and the total chord (R,) of rays, origins and directions
+        (R, 3). transfer: a `TransferFunction`. chunk, shift: as for `lengths`."""
         table = tuple(
             np.asarray(getattr(transfer, k), np.float64)
             for k in ("positions", "extinctions", "colors")
@@ -211,8 +214,8 @@ class BruteForce:
     def ambiguous(
         self, origins: Any, directions: Any, transfer: Any, by: float, tolerance: float
     ) -> np.ndarray:
-        """Which rays (R,) see something else when moved by `by` of the diagonal in any of twelve
-        directions."""
+        """Which rays (R,) see something else, by more than `tolerance`, when moved by `by` of the
+        diagonal in any of twelve directions. origins, directions, transfer: as for `render`."""
         seen = np.stack(
             [self.render(origins, directions, transfer, shift=by * u)[0] for u in AROUND]
         )

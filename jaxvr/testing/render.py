@@ -105,8 +105,12 @@ def assert_render_close(
         if isinstance(camera, Camera):
             found = render(volume, camera, transfer, background=background, status=True, **how)
         else:
+            origins, directions = camera
             found = render_rays(
-                *(volume, *camera, transfer), background=background, status=True, **how
+                *(volume, origins, directions, transfer),
+                background=background,
+                status=True,
+                **how,
             )
         image, status = found  # asked for, so that odd views, which are meant, give no warning
         check(status)
