@@ -4,7 +4,7 @@
 
 Each mesh is seen by rays of all kinds (`FAMILIES`) under a transfer function of eleven control
 points with a peak and a jump, at an optical depth of about 3, and compared with the brute force of
-`tests/reference.py`, which is given the same numbers: in float32 the points, scalars, rays and
+`jaxvr.testing.brute`, which is given the same numbers: in float32 the points, scalars, rays and
 transfer function as rounded to float32. Two sorts of ray are kept apart from the rest:
 
 - *ambiguous* ones, for which the exact picture itself is discontinuous: they lie in the boundary
@@ -33,9 +33,9 @@ import jax
 import jax.numpy as jnp
 
 import jaxvr
+from jaxvr.testing.brute import BruteForce
 from jaxvr.volume import read_mesh
 from jaxvr.volume.connectivity import FACES
-from tests.reference import Reference
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("JAXVR_DATA", ROOT.parent / "shared" / "data"))
@@ -90,7 +90,7 @@ def _inner_faces(mesh: Any) -> np.ndarray:
 
 
 def make_rays(
-    mesh: Any, reference: Reference, family: str, count: int, rng: np.random.Generator
+    mesh: Any, reference: BruteForce, family: str, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions (count, 3) of a family, in the mesh's dtype.
 
@@ -140,7 +140,7 @@ def make_rays(
     return origins.astype(dtype), directions.astype(dtype)
 
 
-def lattice_rays(mesh: Any, reference: Reference) -> tuple[np.ndarray, np.ndarray]:
+def lattice_rays(mesh: Any, reference: BruteForce) -> tuple[np.ndarray, np.ndarray]:
     """Orthographic views along the six axis directions, pixel centres at every vertex of a lattice
     and half-way between them: rays in faces, along edges and through vertices."""
     points = np.asarray(mesh.points)
@@ -168,7 +168,7 @@ def compare(
 ) -> dict[str, Any]:
     """Errors of `render_rays` on families of rays; `keywords` go to it."""
     dtype = str(np.asarray(mesh.points).dtype)
-    reference = Reference(mesh)
+    reference = BruteForce(mesh)
     length = 0.5 * reference.diagonal
     tf = transfer_function(mesh.values, length, dtype)
     names = np.repeat(list(families), [len(o) for o, _ in families.values()])
@@ -219,7 +219,7 @@ def run_mesh(name: str, dtype: str, rays: int, location: str | None = None) -> d
         mesh = read_mesh(DATA / f"{name}.vtu", FIELDS[name], np.dtype(dtype))
     if location is not None:
         mesh = at_location(mesh, location)
-    reference = Reference(mesh)
+    reference = BruteForce(mesh)
     rng = np.random.default_rng(0)
     each = -(-rays // len(FAMILIES))
     families = {k: make_rays(mesh, reference, k, each, rng) for k in FAMILIES}

@@ -4,7 +4,7 @@
 
 With a constant extinction e, length = -log1p(-alpha) / e is what a ray crossed of the mesh; e is
 1 / diagonal, so that neither alpha nor its complement loses digits. It is compared with the sum of
-the ray's chords in all cells, by the brute force of `tests/reference.py` on several processes: a
+the ray's chords in all cells, by the brute force of `jaxvr.testing` on several processes: a
 box hierarchy gives candidate cells (some 200 a ray), which are clipped in float64; rays that then
 differ by more than the tolerance are clipped again in extended precision, and only what differs
 there counts. A lost ray, or one caught in a loop, would be off by a cell at least.
@@ -35,7 +35,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tests.reference import AROUND, Reference
+from jaxvr.testing.brute import AROUND, BruteForce
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("JAXVR_DATA", ROOT.parent / "shared" / "data"))
@@ -51,7 +51,7 @@ def _start(arrays: tuple[np.ndarray, np.ndarray]) -> None:
     points, cells = arrays
     mesh = SimpleNamespace(points=points, cells=cells, values=np.zeros(len(points)))
     mesh.location = "point"
-    _reference = Reference(mesh, np.float64)
+    _reference = BruteForce(mesh, np.float64)
 
 
 def _lengths(rays: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
@@ -139,7 +139,7 @@ def run_mesh(name: str, dtype: str, count: int, processes: int, known: dict) -> 
     off = np.flatnonzero(relative(length, exact) > TOLERANCE[dtype])
     vague = np.zeros(count, bool)
     if len(off):
-        fine = Reference(mesh)
+        fine = BruteForce(mesh)
         rays = origins[off], directions[off]
         exact[off] = fine.lengths(*rays)
         moved = [fine.lengths(*rays, shift=NUDGE[dtype] * u) for u in AROUND]

@@ -13,13 +13,13 @@ shade many, since segments do not depend on the transfer function.
 
 Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, `view`, `optics`,
 `order`, `trace`, `composite`, `native`, `adjoint`, `defaults`, `hints`, `render`, `probe`, `fit`,
-`files`, `plot`, `pictures`, `interact`, `cli`. Those of `native` are compiled loops, which serve
-where they can with the same results.
+`files`, `testing`, `plot`, `pictures`, `interact`, `cli`. Those of `native` are compiled loops,
+which serve where they can with the same results; no other room imports from `testing`.
 """
 
 from typing import TYPE_CHECKING
 
-from jaxvr import native, order
+from jaxvr import native, order, testing
 from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay
 from jaxvr.composite import Over
@@ -106,6 +106,7 @@ __all__ = [
     "save_image",
     "shade",
     "ssim",
+    "testing",
     "trace",
     "turntable",
     "unload_ipython_extension",

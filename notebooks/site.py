@@ -30,6 +30,7 @@ PAGES = {
     "Fitting": ("fit",),
     "Plots": ("plot",),
     "Notebooks": ("interact",),
+    "Testing": ("testing",),
 }
 # What users subclass or are given, but do not import from the top.
 MORE = {

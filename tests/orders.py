@@ -2,17 +2,17 @@
 
 JAX keeps what it has traced for the life of a process, and a rule of a `custom_vjp` may leave in it
 what a later gradient reads. So a gradient is a function of its operands *and* of the history of
-the process, unless a test says that it is not: `alone` makes each gradient with caches cleared, the
-other functions make them in company, and all must agree to the bit. Clearing the caches before an
-order is part of it: a pattern that has been compiled once is no longer traced, and hides the fault.
+the process, unless a test says that it is not: `alone` makes each gradient with caches cleared,
+programs make them in company, and all must agree. Clearing the caches before a program is part of
+it: a pattern that has been compiled once is no longer traced, and hides the fault.
 """
 
 from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -24,6 +24,8 @@ PATTERNS = {name: (name,) for name in OPERANDS} | {"all": OPERANDS}
 NAMES = tuple(PATTERNS)
 Bits = tuple[bytes, ...]
 T = TypeVar("T")
+# A name makes a pullback by that pattern, a number i calls the one made as the i-th.
+Program = Sequence[str | int]
 
 
 class Scene:
@@ -67,44 +69,37 @@ class Scene:
         )
         return lambda: tuple(np.asarray(x).tobytes() for x in pull(self.cotangent))
 
-    def alone(self) -> dict[str, Bits]:
-        """Each pattern's gradient, as the first of a process."""
+    def run(self, steps: Program) -> dict[int, Bits]:
+        """The gradients of a program: what the pullback made as the i-th gives, by i."""
+        jax.clear_caches()
+        pullbacks: list[Any] = []
         found = {}
-        for name in NAMES:
-            jax.clear_caches()
-            found[name] = self.pullback(name)()
+        for step in steps:
+            if isinstance(step, str):
+                pullbacks.append(self.pullback(step))
+            else:
+                found[step] = pullbacks[step]()
         return found
 
-    def interleaved(self, made: Sequence[str], called: Sequence[int]) -> list[Bits]:
-        """Pullbacks made in one order, and called in another: number called[i] as the i-th.
-        Returns the gradients in the order in which they were made."""
-        jax.clear_caches()
-        pullbacks = [self.pullback(name) for name in made]
-        found: dict[int, Bits] = {i: pullbacks[i]() for i in called}
-        return [found[i] for i in range(len(made))]
-
-    def traced(self, made: Sequence[str], called: Sequence[int]) -> list[str]:
-        """As `interleaved`, but what the pullbacks would compute, as text: nothing is compiled,
-        which takes nearly all of the time."""
+    def trace(self, steps: Program) -> dict[int, str]:
+        """As `run`, but what the pullbacks would compute, as text: nothing is compiled, which takes
+        nearly all of the time. What is computed differs where what would be computed does."""
         jax.clear_caches()
         found: dict[int, str] = {}
 
         def outer(operands, cotangent):
-            pullbacks = []
-            for name in made:
-                chosen = {n: operands[n] for n in PATTERNS[name]}
-                pullbacks.append(jax.vjp(lambda xs: self.image(**xs), chosen)[1])
-            for i in called:
-                text = str(jax.make_jaxpr(pullbacks[i])(cotangent).jaxpr)
-                found[i] = re.sub(r" at 0x[0-9a-f]+", "", text)
+            pullbacks: list[Any] = []
+            for step in steps:
+                if isinstance(step, str):
+                    chosen = {n: operands[n] for n in PATTERNS[step]}
+                    pullbacks.append(jax.vjp(lambda xs: self.image(**xs), chosen)[1])
+                else:
+                    text = str(jax.make_jaxpr(pullbacks[step])(cotangent).jaxpr)
+                    found[step] = re.sub(r" at 0x[0-9a-f]+", "", text)
             return ()
 
         jax.make_jaxpr(outer)({n: self.operand(n) for n in OPERANDS}, self.cotangent)
-        return [found[i] for i in range(len(made))]
-
-    def traced_alone(self) -> dict[str, str]:
-        """What each pattern's pullback would compute as the first of a process."""
-        return {name: self.traced([name], [0])[0] for name in NAMES}
+        return found
 
 
 _OWNERS = {
@@ -114,19 +109,33 @@ _OWNERS = {
 }
 
 
-def pairs() -> Iterator[tuple[str, str]]:
-    """All ordered pairs of patterns, a pattern with itself included."""
-    return itertools.product(NAMES, NAMES)
+def alone(how: Callable[[Program], dict[int, T]], names: Sequence[str] = NAMES) -> dict[str, T]:
+    """What patterns give as the first of a process. how: a scene's `run` or `trace`."""
+    return {name: how([name, 0])[0] for name in names}
 
 
-def wrong(made: Sequence[str], found: Sequence[T], alone: dict[str, T]) -> list[str]:
-    """The patterns whose gradients differ from what they are alone, in the order of `made`."""
-    return [f"{i}: {n}" for i, (n, x) in enumerate(zip(made, found, strict=True)) if x != alone[n]]
+def wrong(steps: Program, found: dict[int, T], alone: dict[str, T]) -> list[str]:
+    """The gradients of a program that differ from what they are alone."""
+    made = [s for s in steps if isinstance(s, str)]
+    return [f"{made[i]} (made as number {i})" for i, x in found.items() if x != alone[made[i]]]
 
 
-def sequences(count: int, seed: int = 0) -> Iterator[tuple[tuple[str, ...], tuple[int, ...]]]:
-    """Random sequences of six patterns, and random orders in which their pullbacks are called."""
+def pairs() -> Iterator[Program]:
+    """Two pullbacks made, then called: all ordered pairs, a pattern with itself included."""
+    for a, b in itertools.product(NAMES, NAMES):
+        yield [a, b, 0, 1]
+
+
+def sequences(count: int, seed: int = 0) -> Iterator[Program]:
+    """Six pullbacks at random, each called at a random moment after it was made."""
     rng = np.random.default_rng(seed)
     for _ in range(count):
-        made = tuple(NAMES[i] for i in rng.integers(len(NAMES), size=6))
-        yield made, tuple(int(i) for i in rng.permutation(6))
+        made = [NAMES[i] for i in rng.integers(len(NAMES), size=6)]
+        steps: list[str | int] = []
+        waiting: list[int] = []
+        for i, name in enumerate(made):
+            steps.append(name)
+            waiting.append(i)
+            while waiting and rng.random() < 0.35:
+                steps.append(waiting.pop(int(rng.integers(len(waiting)))))
+        yield steps + [waiting[i] for i in rng.permutation(len(waiting))]

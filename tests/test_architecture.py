@@ -12,8 +12,8 @@ import jaxvr
 ROOT = Path(jaxvr.__file__).parent
 ROOMS = [
     "_core", "numerics", "volume", "view", "optics", "order", "trace", "composite", "native",
-    "adjoint", "arguments", "defaults", "hints", "render", "probe", "fit", "shard", "files", "plot",
-    "pictures", "interact", "cli", "__main__",
+    "adjoint", "arguments", "defaults", "hints", "render", "probe", "fit", "shard", "files",
+    "testing", "plot", "pictures", "interact", "cli", "__main__",
 ]  # fmt: skip
 FILES = sorted(p.relative_to(ROOT) for p in ROOT.rglob("*.py") if p.name != "__init__.py")
 
@@ -49,10 +49,18 @@ def test_rooms_import_from_above(path):
             assert ROOMS.index(room) <= mine, f"{path}:{line} imports from {room}"
 
 
+def test_nothing_imports_from_testing():
+    for path in FILES:
+        rooms = {room for room, _ in imports(path)}
+        assert room_of(path) == "testing" or "testing" not in rooms, path
+
+
 def test_custom_vjp_stands_in_adjoint_only():
     for path in FILES:
-        if "custom_vjp" in (ROOT / path).read_text():
-            assert room_of(path) == "adjoint", path
+        for node in ast.walk(ast.parse((ROOT / path).read_text())):
+            name = getattr(node, "attr", getattr(node, "id", None))
+            if isinstance(node, ast.Attribute | ast.Name) and name in ("custom_vjp", "defvjp"):
+                assert room_of(path) == "adjoint", f"{path}:{node.lineno}"
 
 
 def test_matplotlib_stands_in_plot_only():

@@ -18,8 +18,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import jaxvr
 from experiments import exactness, lost_rays
+from jaxvr.testing.brute import BruteForce
 from jaxvr.volume import datasets
-from tests.reference import Reference
 
 pytestmark = pytest.mark.usefixtures("loops")
 
@@ -35,7 +35,7 @@ def _one_tet(values, location="point"):
 
 def test_reference_knows_the_chord_and_the_integral_of_one_cell():
     """s = x along a ray in x: extinction e x, colour x, from 0 to L; rgb = 1 - ... by parts."""
-    reference = Reference(_one_tet([0.0, 1.0, 0.0, 0.0]))
+    reference = BruteForce(_one_tet([0.0, 1.0, 0.0, 0.0]))
     tf = SimpleNamespace(
         positions=np.array([0.0, 1.0]),
         extinctions=np.array([0.0, 2.0]),
@@ -54,7 +54,7 @@ def test_reference_knows_the_chord_and_the_integral_of_one_cell():
 
 
 def test_reference_splits_at_jumps_and_thick_slabs():
-    reference = Reference(_one_tet([0.0, 1.0, 0.0, 0.0]))
+    reference = BruteForce(_one_tet([0.0, 1.0, 0.0, 0.0]))
     tf = SimpleNamespace(
         positions=np.array([0.25, 0.25]),
         extinctions=np.array([0.0, 400.0]),
@@ -70,7 +70,7 @@ def test_reference_counts_a_ray_in_shared_faces_once():
     g = np.arange(1, 8) / 8
     u, v = (x.ravel() for x in np.meshgrid(g, g))
     origins = np.stack([u, v, np.full(u.size, -1.0)], 1)
-    found = Reference(mesh).lengths(origins, np.tile([0.0, 0, 1], (u.size, 1)))
+    found = BruteForce(mesh).lengths(origins, np.tile([0.0, 0, 1], (u.size, 1)))
     np.testing.assert_allclose(found, 1.0, rtol=1e-14)
 
 
@@ -87,7 +87,7 @@ def test_zoo_cells(data_path, dtype, location):
 
 def test_lattice_seen_exactly_along_its_axes(dtype):
     mesh = datasets.box((3, 3, 3), dtype=dtype)
-    reference = Reference(mesh)
+    reference = BruteForce(mesh)
     rng = np.random.default_rng(4)
     found = exactness.compare(
         mesh,
@@ -105,7 +105,7 @@ def test_lattice_seen_exactly_along_its_axes(dtype):
 def test_quadrature_is_an_independent_witness(data_path):
     data_path("football_zoo.vtu")
     mesh = exactness.read_mesh(data_path("football_zoo.vtu"), None, np.float64)
-    reference = Reference(mesh)
+    reference = BruteForce(mesh)
     rays = exactness.make_rays(mesh, reference, "random", 100, np.random.default_rng(0))
     found = exactness.compare(mesh, {"random": rays}, integrator=jaxvr.Quadrature(samples=12))
     assert found["worst"] <= 1e-10, found
