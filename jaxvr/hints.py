@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._core.checks import is_concrete
+from ._core.units import near_one
 from .optics import TransferFunction
 from .view.camera import Camera
 from .volume.mesh import TetMesh
@@ -139,13 +140,15 @@ def _glance(parallel, seen, values, points, eye, target, positions, extinctions)
     rows = jnp.pad(points, ((0, -len(points) % 8), (0, 0)), mode="edge").reshape(-1, 24)
     low = rows.min(axis=0).reshape(8, 3).min(axis=0)
     high = rows.max(axis=0).reshape(8, 3).max(axis=0)
+    size = high - low
+    unit = near_one(size)  # products of lengths may under- or overflow
     if parallel:
-        forward, middle = target - eye, (low + high) / 2 - eye
-        cut = jnp.abs(forward @ middle) < jnp.abs(forward) @ ((high - low) / 2)
+        forward, middle = (target - eye) * near_one(target - eye), (low + high) / 2 - eye
+        cut = jnp.abs(forward @ (middle * unit)) < jnp.abs(forward) @ (size * unit / 2)
     else:
         cut = ((low < eye) & (eye < high)).all()
     ends = (seen, values.min(), values.max(), positions[0], positions[-1])
-    ends = (*ends, extinctions.max(), jnp.linalg.norm(high - low), cut)
+    ends = (*ends, extinctions.max(), jnp.linalg.norm(size * unit) / unit, cut)
     return jnp.stack([jnp.asarray(x, points.dtype) for x in ends])
 
 
