@@ -246,8 +246,9 @@ def cut(nodes: Nodes, segment: Segment, cursor: Cursor) -> tuple[Piece, Cursor, 
     per_scalar = 1 / jnp.where(flat, 1, change)
     fraction = jnp.where(flat, 1.0, (end - scalar) * per_scalar)
     fraction = jnp.where(astray | jump, 0.0, fraction)
-    inside = ~(outermost | jump | astray)
-    slope = jnp.where(inside, 1 / jnp.where(inside, high - low, 1), 0.0)
+    width = high - low
+    inside = (width > 0) & ~(outermost | astray)
+    slope = jnp.where(inside, 1 / jnp.where(inside, width, 1), 0.0)
 
     def place(at: Array, in_jump: Array) -> Array:
         return jnp.where(jump, in_jump.astype(at.dtype), (at - low) * slope)
