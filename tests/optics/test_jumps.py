@@ -141,9 +141,10 @@ def test_a_jump_has_no_width_in_any_unit(exponent, dtype):
     unit = np.dtype(dtype).type(2.0**exponent)
     near = np.array([0.25, 0.5, np.nextafter(np.float32(0.5), np.float32(1)), 0.75], dtype)
     segment = segment_of([(0.25, 0.75, 1.0), (0.7, 0.3, 1.0)], dtype)
+    compiled = quick.jit(integrate, static_argnums=0)
     for positions in (near, np.array([0.25, 0.5, 0.5, 0.75], dtype)):
         tf = TransferFunction(positions * unit, COLORS[:4], EXTINCTIONS[:4], dtype=dtype)
-        rgb, depth, _ = integrate(
+        rgb, depth, _ = compiled(
             jaxvr.Analytic(), tf, Segment(segment.front * unit, segment.back * unit, segment.length)
         )
         mean = [(a + b) / 2 for a, b in zip(EXTINCTIONS[:3], EXTINCTIONS[1:4])]
