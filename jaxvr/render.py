@@ -94,8 +94,9 @@ def render(
 
     Raises:
       ValueError: for NaN or infinite operands, a budget below one byte, or a compositor that goes
-        back to front with a tracer that cannot. RenderError: if a ray could not be followed. Of
-        values only where they are concrete, not inside your own `jit`.
+        back to front with a tracer that cannot. RenderError: if a ray could not be followed, and
+        for scalars and lengths out of the range that `jaxvr.units` states. Of values only where
+        they are concrete, not inside your own `jit`.
 
     Warns, also only there, with a `jaxvr.ViewWarning` that says what a blank picture comes from, or
     that the field's range and the transfer function's do not fit, that the numbers may be opacities

@@ -1,5 +1,5 @@
 """Pictures and gradients do not depend on the user's units: the same bits for scalars, lengths and
-extinctions times powers of two over the range that `jaxvr.units` states, and words outside of it."""
+extinctions times powers of two over the range that `jaxvr.units` states, and words outside."""
 
 from __future__ import annotations
 
@@ -48,8 +48,9 @@ class Setting:
         self.numbers = {k: np.asarray(x, self.dtype) for k, x in self.numbers.items()}
 
     def units(self, name: str, scalar: int, length: int):
-        s, l = (0, 1) if name == "size" and self.parallel else POWERS.get(name, (0, 0))
-        return np.ldexp(np.ones((), self.dtype), s * scalar + l * length)
+        is_extent = name == "size" and self.parallel
+        of_scalar, of_length = (0, 1) if is_extent else POWERS.get(name, (0, 0))
+        return np.ldexp(np.ones((), self.dtype), of_scalar * scalar + of_length * length)
 
     def scaled(self, scalar: int = 0, length: int = 0):
         return {k: x * self.units(k, scalar, length) for k, x in self.numbers.items()}
@@ -205,8 +206,8 @@ def test_in_the_units_of_physics():
     want = np.asarray(setting.render(setting.scaled()))
     for scalar, length in ((1e-28, 1.0), (4e-21, 1.0), (1e-24, 5e-10), (1e38, 9e20)):
         numbers = {k: x.copy() for k, x in setting.scaled().items()}
-        for name, (s, l) in POWERS.items():
-            numbers[name] = numbers[name] * scalar**s * length**l
+        for name, (of_scalar, of_length) in POWERS.items():
+            numbers[name] = numbers[name] * scalar**of_scalar * length**of_length
         np.testing.assert_allclose(setting.render(numbers), want, atol=1e-12)
 
 

@@ -16,8 +16,8 @@ from jax import lax
 
 Array = jax.Array
 
-# The largest number of an array of lengths or of scalars is to be at least 2^-SMALL: what is smaller
-# by a rounding is a normal number then. (XLA takes subnormal ones for 0.)
+# The largest number of an array of lengths or of scalars is to be at least 2^-SMALL: what is
+# smaller by a rounding is a normal number then. (XLA takes subnormal ones for 0.)
 SMALL = {"float32": 100, "float64": 960}
 _NONE = -(1 << 20)
 
@@ -61,3 +61,28 @@ def near_one(x: Array) -> Array:
     """The power of two () that brings the largest size in `x` to [1/2, 1); 1 if all are 0."""
     exponent = exponent_of(x)
     return power_of_two(jnp.where(is_none(exponent), 0, -exponent), x.dtype)
+
+
+def scaled_to_one(x: np.ndarray) -> tuple[np.ndarray, int]:
+    """NumPy's numbers times 2^-e in float64, with the largest size in [1/2, 1), and e."""
+    x = np.asarray(x, np.float64)
+    exponent = int(np.frexp(np.abs(x).max(initial=0.0))[1])
+    return np.ldexp(x, -exponent), exponent
+
+
+def norm(x: np.ndarray) -> float:
+    """The Euclidean length of NumPy's numbers, whatever their unit is."""
+    x, exponent = scaled_to_one(x)
+    return float(np.ldexp(np.linalg.norm(x), exponent))
+
+
+def require_lengths(name: str, x: Any) -> None:
+    """ValueError for lengths out of range; concrete ones, for verbs that have no status."""
+    exponent, dtype = exponent_of(jnp.asarray(x)), np.dtype(x.dtype)
+    if bool(is_small(exponent, dtype) | is_large(exponent, dtype)):
+        b = SMALL[dtype.name]
+        raise ValueError(
+            f"{name} reach to {np.abs(np.asarray(x)).max():.3g}, but in {dtype} the largest "
+            f"coordinate has to lie between 2^-{b} = {2.0**-b:.2g} and 2^{b} = {2.0**b:.2g}. Take "
+            "another unit of length, or float64."
+        )

@@ -107,9 +107,10 @@ class Piece(NamedTuple):
     t (2, R): where the piece starts and ends, as fractions of the segment.
     place (2, R): the same ends as fractions of the slab, 0 at `left`.
     fraction (R,): its share of the segment's length.
-    slope (2, R): at a soft end 1 / width of the slab, 0 outside the control points; at a hard end 0.
-    rate (2, R): at a hard end, what its fraction loses for each unit by which the scalar runs ahead
-    of the border there, 1 / (s_b - s_f) at the piece's end and minus that at its start; else 0.
+    slope (2, R): at a soft end 1 / width of the slab, 0 outside the control points; at a hard end
+    0. rate (2, R): at a hard end, what its fraction loses for each unit by which the scalar runs
+    ahead of the border there, 1 / (s_b - s_f) at the piece's end and minus that at its start;
+    else 0.
     """
 
     left: Array

@@ -1,5 +1,5 @@
-"""Jumps of the transfer function: no width, a place that is differentiated, and the upper side where
-a segment meets one exactly."""
+"""Jumps of the transfer function: no width, a place that is differentiated, and the upper side
+where a segment meets one exactly."""
 
 from __future__ import annotations
 
