@@ -166,7 +166,7 @@ def run(
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--size", type=int, default=48)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--tiny", action="store_true")

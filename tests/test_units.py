@@ -154,9 +154,9 @@ def test_out_of_range_is_told_by_all_verbs():
     mesh, camera, transfer = setting.parts(setting.scaled(-101, 0))
     segments = jaxvr.trace(*setting.parts(setting.scaled())[:2])
     small = dataclasses.replace(segments, scalar=segments.scalar * np.float32(2.0**-101))
-    rays = [np.asarray(x).reshape(-1, 3)[:2] for x in camera.rays()]
+    origins, directions = (np.asarray(x).reshape(-1, 3)[:2] for x in camera.rays())
     for call in (
-        lambda: jaxvr.render_rays(mesh, *rays, transfer),
+        lambda: jaxvr.render_rays(mesh, origins, directions, transfer),
         lambda: jaxvr.trace(mesh, camera),
         lambda: jaxvr.shade(small, transfer),
         lambda: jaxvr.probe(mesh, camera, transfer, (2, 3)),

@@ -4,6 +4,7 @@ where a segment meets one exactly."""
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -178,8 +179,8 @@ def test_faces_at_a_jump(lattice, eye):
     EXT = tf.extinctions
     start = jnp.asarray(0.0), segments.scalar
     want = [float(loss(jnp.asarray(h), segments.scalar, None)) for h in (-1e-5, 1e-5)]
-    kinds = [(jaxvr.Replay(native=None), None), (jaxvr.Replay(native=False), None)]
-    kinds.append((None, jaxvr.Over(direction="back to front")))
+    behind = jaxvr.Over(direction="back to front")
+    kinds = [(jaxvr.Replay(native=None), None), (jaxvr.Replay(native=False), None), (None, behind)]
     found = [jax.grad(loss, (0, 1))(*start, *kind) for kind in kinds]
     for by_move, by_scalar in found:
         assert float(by_move) == pytest.approx((want[1] - want[0]) / 2e-5, rel=1e-4)
@@ -204,7 +205,7 @@ def test_render_across_jumps():
         volume = mesh.replace(values=values, points=points)
         return (jaxvr.render(volume, camera.replace(eye=eye), tf) * weights).sum()
 
-    args = [jnp.zeros(5), mesh.values, mesh.points, camera.eye]
+    args: list[Any] = [jnp.zeros(5), mesh.values, mesh.points, camera.eye]
     slope = jax.grad(function, (0, 1, 2, 3))(*args)
     rng = np.random.default_rng(0)
     for k, x in enumerate(args):
