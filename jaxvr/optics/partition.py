@@ -116,9 +116,10 @@ class Piece(NamedTuple):
     t (2, R): where the piece starts and ends, as fractions of the segment.
     place (2, R): the same ends as fractions of the slab, 0 at `left`.
     fraction (R,): its share of the segment's length.
-    slope (2, R): at a soft end 1 / width of the slab, 0 outside the control points; at a hard end 0.
-    rate (2, R): at a hard end, what its fraction loses for each unit by which the scalar runs ahead
-    of the border there, 1 / (s_b - s_f) at the piece's end and minus that at its start; else 0.
+    slope (2, R): at a soft end 1 / width of the slab, 0 outside the control points; at a hard end
+    0. rate (2, R): at a hard end, what its fraction loses for each unit by which the scalar runs
+    ahead of the border there, 1 / (s_b - s_f) at the piece's end and minus that at its start;
+    else 0.
     """
 
     left: Array
@@ -255,8 +256,9 @@ def cut(nodes: Nodes, segment: Segment, cursor: Cursor) -> tuple[Piece, Cursor, 
     per_scalar = 1 / jnp.where(flat, 1, change)
     fraction = jnp.where(flat, 1.0, (end - scalar) * per_scalar)
     fraction = jnp.where(astray | jump, 0.0, fraction)
-    inside = ~(outermost | jump | astray)
-    slope = jnp.where(inside, 1 / jnp.where(inside, high - low, 1), 0.0)
+    width = high - low
+    inside = (width > 0) & ~(outermost | astray)
+    slope = jnp.where(inside, 1 / jnp.where(inside, width, 1), 0.0)
 
     def place(at: Array, in_jump: Array) -> Array:
         return jnp.where(jump, in_jump.astype(at.dtype), (at - low) * slope)

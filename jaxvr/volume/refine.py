@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._core.checks import is_concrete
+from .._core.units import scaled_to_one
 from .geometry import signed_volumes
 from .mesh import TetMesh, _from_cells
 from .packing import cell_of, corner_of
@@ -220,12 +221,14 @@ def _keys(rows: np.ndarray) -> np.ndarray:
 
 
 def _longest(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The longest edge of each cell: its key (T,), of equals the lowest, and its length squared.
-    rows (T, 4): welded ids, whose order and coordinates all cells round an edge have in common."""
+    """The longest edge of each cell: its key (T,), of equals the lowest, and its length squared,
+    in a unit of its own. rows (T, 4): welded ids, whose order and coordinates all cells round an
+    edge have in common."""
+    points, _ = scaled_to_one(points)
     keys, squares = np.empty(len(rows), np.int64), np.empty(len(rows))
     for i in range(0, len(rows), _CHUNK):
         r = rows[i : i + _CHUNK]
-        q = points[r].astype(np.float64)
+        q = points[r]
         square = ((q[:, _EDGES[:, 1]] - q[:, _EDGES[:, 0]]) ** 2).sum(2)
         squares[i : i + _CHUNK] = most = square.max(1)
         best = square == most[:, None]
