@@ -5,8 +5,8 @@ order on both sides, and face k (opposite local vertex k) of a row (q0, q1, q2, 
 (-1)**k in the orientation that the row induces. Two neighbours c (face k) and n (face f) lie on
 opposite sides of the face exactly if o(c) o(n) = -(-1)**(k + f), o being the sign of a row's
 determinant. A mesh where that fails somewhere is folded; `combinatorial` finds the signs that it
-would have if it were not, which is what a walk through the cells has to go by. Cells without volume
-have no sign of their own; they get the one that fits their neighbours (`fill_signs`).
+would have if it were not, which is what a walk through the cells has to go by. Cells without
+volume have no sign of their own; they get the one that fits their neighbours (`fill_signs`).
 """
 
 from __future__ import annotations
