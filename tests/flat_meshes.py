@@ -29,7 +29,7 @@ def lattice(n: int = 5, jitter: float = 0.0, seed: int = 0) -> FlatMesh:
     """n points a side in the unit cube, those inside moved by normal deviates times `jitter`."""
     axis = np.arange(n) / (n - 1)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    inner = ((points > 0) & (points < 1)).all(1)
+    inner = np.all((points > 0) & (points < 1), axis=1)
     moves = np.random.default_rng(seed).normal(size=points.shape)
     return _mesh(points + jitter * moves * inner[:, None], inner)
 

@@ -212,7 +212,8 @@ def test_render_across_jumps():
         way = jnp.asarray(rng.normal(size=x.shape))
 
         def at(h, k=k, x=x, way=way):
-            return float(function(*args[:k], x + h * way, *args[k + 1 :]))
+            moved: Any = [*args[:k], x + h * way, *args[k + 1 :]]
+            return float(function(*moved))
 
         coarse, fine = ((at(h) - at(-h)) / (2 * h) for h in (2e-5, 1e-5))
         assert float((slope[k] * way).sum()) == pytest.approx((4 * fine - coarse) / 3, rel=1e-6)
