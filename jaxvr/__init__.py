@@ -12,9 +12,9 @@ has no gradient, depths and scalars are arithmetic on local data and have one. A
 shade many, since segments do not depend on the transfer function.
 
 Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, `view`, `optics`,
-`order`, `trace`, `composite`, `native`, `adjoint`, `defaults`, `hints`, `render`, `probe`, `fit`,
-`files`, `testing`, `plot`, `pictures`, `interact`, `cli`. Those of `native` are compiled loops,
-which serve where they can with the same results; no other room imports from `testing`.
+`order`, `trace`, `composite`, `native`, `adjoint`, `units`, `defaults`, `hints`, `render`, `probe`,
+`fit`, `files`, `testing`, `plot`, `pictures`, `interact`, `cli`. Those of `native` are compiled
+loops, which serve where they can with the same results; no other room imports from `testing`.
 """
 
 from typing import TYPE_CHECKING

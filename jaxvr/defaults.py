@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxvr._core.units import norm
 from jaxvr.arguments import volume_of
 from jaxvr.optics import TransferFunction
 from jaxvr.volume import TetMesh
@@ -18,7 +19,7 @@ DEPTH = 15.0
 def diagonal(volume: TetMesh) -> float:
     """Length of the diagonal of the volume's box, in world units."""
     lo, hi = (np.asarray(x, np.float64) for x in volume.bounds())
-    return float(np.linalg.norm(hi - lo))
+    return norm(hi - lo)
 
 
 def default_transfer(

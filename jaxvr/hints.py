@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._core.checks import is_concrete
+from ._core.units import near_one, norm
 from .optics import TransferFunction
 from .view.camera import Camera
 from .volume.mesh import TetMesh
@@ -139,13 +140,15 @@ def _glance(parallel, seen, values, points, eye, target, positions, extinctions)
     rows = jnp.pad(points, ((0, -len(points) % 8), (0, 0)), mode="edge").reshape(-1, 24)
     low = rows.min(axis=0).reshape(8, 3).min(axis=0)
     high = rows.max(axis=0).reshape(8, 3).max(axis=0)
+    size = high - low
+    unit = near_one(size)  # products of lengths may under- or overflow
     if parallel:
-        forward, middle = target - eye, (low + high) / 2 - eye
-        cut = jnp.abs(forward @ middle) < jnp.abs(forward) @ ((high - low) / 2)
+        forward, middle = (target - eye) * near_one(target - eye), (low + high) / 2 - eye
+        cut = jnp.abs(forward @ (middle * unit)) < jnp.abs(forward) @ (size * unit / 2)
     else:
         cut = ((low < eye) & (eye < high)).all()
     ends = (seen, values.min(), values.max(), positions[0], positions[-1])
-    ends = (*ends, extinctions.max(), jnp.linalg.norm(high - low), cut)
+    ends = (*ends, extinctions.max(), jnp.linalg.norm(size * unit) / unit, cut)
     return jnp.stack([jnp.asarray(x, points.dtype) for x in ends])
 
 
@@ -172,7 +175,7 @@ def _faint(
             f"has no extinction where the field lies, from {_range(*field)}. Move its positions or "
             "raise its extinctions there."
         )
-    diagonal = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+    diagonal = norm(points.max(axis=0) - points.min(axis=0))
     depth = strongest * diagonal
     if depth < THIN or (blank and alpha > 0):
         found = -np.log1p(-alpha) if alpha > 0 else depth
@@ -278,7 +281,7 @@ def _dense(volume: TetMesh, transfer: TransferFunction, field: tuple[float, floa
     """That opacities may stand for extinctions: what would let light through hides all behind it
     within one cell."""
     points = _used(volume)
-    diagonal = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+    diagonal = norm(points.max(axis=0) - points.min(axis=0))
     shown = _shown(volume, transfer, field)[:, 3]
     strongest, cell = shown[shown < 1].max(initial=0.0), diagonal / volume.n_tets ** (1 / 3)
     if strongest * cell < DENSE_CELL or strongest * diagonal < DENSE:
@@ -342,7 +345,7 @@ def _ends(transfer: TransferFunction) -> tuple[float, float]:
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
-    return v / np.linalg.norm(v)
+    return v / norm(v)
 
 
 def _range(low: float, high: float) -> str:

@@ -31,6 +31,7 @@ from jaxvr.composite import Over
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.trace import AbstractTracer
 from jaxvr.trace.recorded import record
+from jaxvr.units import Units, mesh_in, transfer_in, units_of
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size
 from jaxvr.volume.mesh import TetMesh
@@ -125,14 +126,18 @@ def probe(
     else:
         origins, directions = (np.asarray(x) for x in rays_of(*camera, volume))
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+    # By a power of two first, so that squares neither under- nor overflow.
+    largest = np.abs(directions).max(axis=1, keepdims=True, initial=0)
+    directions = np.ldexp(directions, -np.frexp(largest)[1])
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     pipeline = Pipeline(tracer_of(tracer), integrator_of(integrator), Over())
     size = min(batch_size(volume.dtype), 1 << max(len(origins) - 1, 0).bit_length())
     parts, counts, status = [], [], []
-    scene, table = _prepare(pipeline, volume, transfer)
+    scene, table, units = _prepare(pipeline, volume, transfer)
+    start_at = origins * np.asarray(units.length)
     for first in range(0, len(origins), size):
         here = np.minimum(np.arange(first, first + size), len(origins) - 1)
-        rays = origins[here], directions[here]
+        rays = start_at[here], directions[here]
         nodes, bits = _count(pipeline.tracer, scene, *rays)
         # A power of two, so that few functions are compiled.
         most = 1 << int(np.max(np.asarray(nodes))).bit_length()
@@ -142,9 +147,11 @@ def probe(
         parts.append([x[:used].reshape(used * most, *x.shape[2:])[kept] for x in found])
         counts.append(count[:used])
         status.append(np.asarray(bits)[:used])
-    check(np.concatenate(status))
+    check(np.concatenate(status) | np.asarray(units.status))
     start = np.concatenate([[0], np.cumsum(np.concatenate(counts), dtype=np.int64)])
     cells, back, length, scalars, contributions = (np.concatenate(x) for x in zip(*parts))
+    back, length = back / np.asarray(units.length), length / np.asarray(units.length)
+    scalars = scalars / np.asarray(units.scalar)
     distances = np.stack([np.maximum(back - length, 0), back], axis=1)
     ray = np.repeat(np.arange(len(origins)), np.diff(start))
     positions = origins[ray][:, None] + distances[..., None] * directions[ray][:, None]
@@ -170,10 +177,12 @@ def _pixels_of(pixels: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndar
 
 
 @partial(jax.jit, static_argnums=0)
-def _prepare(pipeline: Pipeline, volume: Any, transfer: Any) -> tuple[Any, Any]:
+def _prepare(pipeline: Pipeline, volume: Any, transfer: Any) -> tuple[Any, Any, Units]:
+    units = units_of(volume.points, volume.values, transfer.positions)
+    volume, transfer = mesh_in(units, volume), transfer_in(units, transfer)
     scene = pipeline.tracer.prepare(volume)
     longest = pipeline.tracer.longest(scene)
-    return scene, pipeline.integrator.prepare(transfer, volume.dtype, longest)
+    return scene, pipeline.integrator.prepare(transfer, volume.dtype, longest), units
 
 
 @partial(jax.jit, static_argnums=0)

@@ -11,6 +11,7 @@ does.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from functools import partial
 from typing import Any
@@ -45,7 +46,8 @@ from jaxvr.composite import Over
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.trace import AbstractTracer, Recorded, Segments
 from jaxvr.trace.beam import are_rays
-from jaxvr.trace.recorded import fill, record
+from jaxvr.trace.recorded import Nodes, fill, record
+from jaxvr.units import mesh_in, transfer_in, units_of
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
 
@@ -56,6 +58,9 @@ ACCELERATOR_BATCH = 1 << 18
 # Numbers that XLA keeps for each ray of a batch: 89 to render, 207 for all gradients at once
 # (differences of its own reports between batches of 2^9 and 2^16 rays; JAX's loops).
 NUMBERS_PER_RAY = 212
+# Segments of a mesh in range are not in range themselves: they may be shorter than coordinates are
+# large by this power of two.
+_PARTS = 20
 
 
 def render(
@@ -91,8 +96,9 @@ def render(
 
     Raises:
       ValueError: for NaN or infinite operands, a budget below one byte, or a compositor that goes
-        back to front with a tracer that cannot. RenderError: if a ray could not be followed. Of
-        values only where they are concrete, not inside your own `jit`.
+        back to front with a tracer that cannot. RenderError: if a ray could not be followed, and
+        for scalars and lengths out of the range that `jaxvr.units` states. Of values only where
+        they are concrete, not inside your own `jit`.
 
     Warns, also only there, with a `jaxvr.ViewWarning` that says what a blank picture comes from, or
     that the field's range and the transfer function's do not fit, that the numbers may be opacities
@@ -242,7 +248,10 @@ def shade(
     transfer = transfer_of(transfer, segments)
     how = _how(pipeline, adjoint, budget, segments)
     with custom_vjp_refused(FORWARD_MODE):
-        return _shade(*how, segments, transfer, background_of(background))
+        image, bits = _shade(*how, segments, transfer, background_of(background))
+    if is_concrete(bits):
+        check(bits)
+    return image
 
 
 def _how(pipeline: Pipeline, adjoint: Any, budget: Any, volume: Any) -> tuple[Any, Any, int]:
@@ -285,39 +294,56 @@ def _render_rays(pipeline, adjoint, size, volume, origins, directions, transfer,
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _shade(pipeline, adjoint, size, segments, transfer, background):
     segments = lax.optimization_barrier(segments)  # as above
+    units = units_of(segments.length, segments.scalar, transfer.positions, parts=_PARTS)
+    segments = dataclasses.replace(
+        segments,
+        length=segments.length * units.length,
+        scalar=segments.scalar * units.scalar,
+    )
+    transfer = transfer_in(units, transfer)
     scene = pipeline.tracer.prepare(segments)
     rays, count = batches(size, (segments.start[:-1], segments.start[1:]))
     rays = pipeline.tracer.prepare_rays(scene, *rays)
     rgba = _finish(pipeline, adjoint, scene, rays, transfer, scene.scalar.dtype, count)[0]
     rgba = jnp.zeros_like(rgba).at[segments.order].set(rgba, unique_indices=True)
-    return _over(rgba, background).reshape(*segments.shape, 4)
+    return _over(rgba, background).reshape(*segments.shape, 4), units.status
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _count(tracer, native, size, volume, origins, directions):
+    units = units_of(volume.points, volume.values)
+    volume, origins = mesh_in(units, volume), origins * units.length
     scene = tracer.prepare(volume)
     rays, count = batches(size, (origins, directions))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(*rays)
     found = compiled.kernels.count_nodes(scene, rays) if native else record(tracer, scene, rays)
-    return tuple(x.reshape(-1)[:count] for x in found)
+    number, status = (x.reshape(-1)[:count] for x in found)
+    return number, status | units.status
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 7))
 def _fill(tracer, native, size, volume, origins, directions, start, total):
+    units = units_of(volume.points, volume.values)
+    volume, origins = mesh_in(units, volume), origins * units.length
     scene = tracer.prepare(volume)
     (origins, directions, start), _ = batches(size, (origins, directions, start))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
     fill_all = compiled.kernels.fill_nodes if native else partial(fill, tracer)
-    return fill_all(scene, rays, start, total)
+    nodes = fill_all(scene, rays, start, total)
+    return Nodes(nodes.scalar / units.scalar, nodes.length / units.length)
 
 
 def _run(pipeline, adjoint, size, volume, origins, directions, transfer):
     """rgba (R, 4) and status (R,) of rays (R, 3)."""
+    units = units_of(volume.points, volume.values, transfer.positions)
+    volume, origins = mesh_in(units, volume), origins * units.length
+    transfer = transfer_in(units, transfer)
     scene = pipeline.tracer.prepare(volume)
     rays, count = batches(size, (origins, directions))
     rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(*rays)
     rgba, status = _finish(pipeline, adjoint, scene, rays, transfer, origins.dtype, count)
-    return rgba, jnp.where(are_rays(origins.T, directions.T), status, status | LOST)
+    status = jnp.where(are_rays(origins.T, directions.T), status, status | LOST)
+    return rgba, status | units.status
 
 
 def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):

@@ -13,13 +13,12 @@ os.environ["XLA_FLAGS"] = " ".join(
 )
 
 import jax
+import outside
 import pytest
 from rooms import *  # noqa: F403 (hooks of pytest)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
-
-DATA = Path(os.environ.get("JAXVR_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 MANY_MAPS = 40_000
 
@@ -28,17 +27,8 @@ MANY_MAPS = 40_000
 gc.set_threshold(200_000, 20, 50)
 
 
-@pytest.fixture(scope="session")
-def data_path():
-    """Path of a file of the real test data; the test fails, loudly, where it is missing."""
-
-    def find(name: str) -> Path:
-        path = DATA / name
-        if not path.exists():
-            pytest.fail(f"{name} is missing: set JAXVR_DATA to the folder of the test data.")
-        return path
-
-    return find
+def pytest_configure(config):
+    config.pluginmanager.register(outside)  # its hooks have the names of those of `rooms`
 
 
 @pytest.fixture(autouse=True)

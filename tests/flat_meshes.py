@@ -122,19 +122,22 @@ def hull_chords(planes: tuple[np.ndarray, np.ndarray], origins, directions) -> n
 
 def rays_at_features(mesh: FlatMesh, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Rays (R, 3) through vertices, midpoints of edges, centres of faces and of cells, by turns:
-    a half along directions of the lattice, the others from anywhere outside. None of them touches
-    the hull at a feature only: targets are those of cells, a little towards the middle."""
+    a half along directions of the lattice, the others from anywhere. None of them lies in a plane
+    of the hull, where it is a matter of taste what it sees: those are moved a little inwards."""
     rng = np.random.default_rng(seed)
     low, high = mesh.points.min(0), mesh.points.max(0)
-    middle, size = (low + high) / 2, np.linalg.norm(high - low)
+    middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     corners = mesh.points[mesh.cells[rng.integers(0, len(mesh.cells), count)]]
     used = 1 + np.arange(count) % 4
     weight = (np.arange(4) < used[:, None]) / used[:, None]
     target = (corners * weight[..., None]).sum(1)
-    on_hull = (corners[:, :1] * 0 + np.abs(target - middle)[:, None]).max((1, 2)) * 0
     along = rng.integers(-1, 2, (count, 3)).astype(float)
     along[(along == 0).all(1)] = [1, 0, 0]
     free = rng.normal(size=(count, 3))
     direction = np.where((np.arange(count) // 4 % 2 == 0)[:, None], along, free)
-    distance = (2 * size + on_hull) / np.linalg.norm(direction, axis=1)
-    return target - direction * distance[:, None], direction
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    normals, offsets = hull_planes(mesh.points)
+    room = np.abs(offsets - target @ normals.T) / size
+    grazes = ((np.abs(direction @ normals.T) < 1e-3) & (room < 1e-3)).any(1)
+    target = np.where(grazes[:, None], target + 0.01 * (middle - target), target)
+    return target - 2 * size * direction, direction

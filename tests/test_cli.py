@@ -40,6 +40,7 @@ def test_info(mesh, capsys):
     assert "values (point)" in out and "48 tetrahedra" in out
 
 
+@pytest.mark.outside("plot3d")
 def test_info_plot3d(data_path, capsys):
     folder = data_path("plot3d")
     grid = next(p for p in sorted(folder.iterdir()) if "xyz" in p.name)

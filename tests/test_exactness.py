@@ -7,7 +7,6 @@ the real data.
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,9 +24,6 @@ from jaxvr.volume import datasets
 pytestmark = pytest.mark.usefixtures("loops")
 
 WORST = {"float64": 1e-10, "float32": 2e-5}
-VECTORS = Path(
-    os.environ.get("JAXVR_VECTORS", Path(__file__).resolve().parents[2] / "shared" / "vectors")
-)
 
 
 def _one_tet(values, location="point"):
@@ -78,6 +74,7 @@ def test_reference_counts_a_ray_in_shared_faces_once():
     np.testing.assert_allclose(found, 1.0, rtol=1e-14)
 
 
+@pytest.mark.outside("football_zoo.vtu")
 @pytest.mark.parametrize("location", [None, "cell", "corner"])
 def test_zoo_cells(data_path, dtype, location):
     data_path("football_zoo.vtu")
@@ -104,6 +101,7 @@ def test_lattice_seen_exactly_along_its_axes(dtype):
     assert found["worst"] <= WORST[dtype], found
 
 
+@pytest.mark.outside("football_zoo.vtu")
 def test_quadrature_is_an_independent_witness(data_path):
     data_path("football_zoo.vtu")
     mesh = exactness.read_mesh(data_path("football_zoo.vtu"), None, np.float64)
@@ -113,6 +111,7 @@ def test_quadrature_is_an_independent_witness(data_path):
     assert found["worst"] <= 1e-10, found
 
 
+@pytest.mark.outside("football_zoo.vtu")
 def test_lost_rays_on_a_small_mesh(data_path, dtype):
     data_path("football_zoo.vtu")
     found = lost_rays.run_mesh("football_zoo", dtype, 1000, 1, {})
@@ -120,13 +119,11 @@ def test_lost_rays_on_a_small_mesh(data_path, dtype):
     assert found["differ_clear"] == 0, found
 
 
+@pytest.mark.outside("vectors/segment_vectors_public.npz")
 @pytest.mark.parametrize(
     "dtype, value, slope", [("float64", 1e-15, 5e-15), ("float32", 5e-7, 7e-7)]
 )
-def test_slab_against_vectors(dtype, value, slope):
-    path = VECTORS / "segment_vectors_public.npz"
-    if not path.exists():
-        pytest.fail(f"{path} is missing: set JAXVR_VECTORS to the folder of the vectors.")
-    found = exactness.check_slab(path, dtype)
+def test_slab_against_vectors(data_path, dtype, value, slope):
+    found = exactness.check_slab(data_path("vectors/segment_vectors_public.npz"), dtype)
     assert found["rgb"] <= value and found["alpha"] <= value, found
     assert found["jacfwd"] <= slope and found["jacrev"] <= slope, found

@@ -32,6 +32,7 @@ from experiments import (
     preintegration_build,
     quantised_table,
     speed,
+    units,
 )
 from experiments.common import read_volume
 from experiments.havs import viewpoints
@@ -73,6 +74,16 @@ def log_table_gain(folder: Path) -> float:
     assert (folder / "log_table_shells.png").stat().st_size > 0
     rms = {row["table"]: row["rms"] for row in report["transfer"]["shells"]}
     return rms["linear"] / rms["log"]
+
+
+def units_range(folder: Path) -> float:
+    """The exponent that scalars and lengths reach in float32 by all ways, in steps of 33."""
+    rows = units.main(["--tiny"])["rows"]
+    assert all("off" not in row["beyond from"] + row["beyond to"] for row in rows), rows
+    double = [r for r in rows if r["dtype"] == "float64"]
+    assert min(min(-r["from"], r["to"]) for r in double) == 957
+    single = [r for r in rows if r["dtype"] == "float32"]
+    return min(min(-r["from"], r["to"]) for r in single)
 
 
 def quantised_table_gain(folder: Path) -> float:
@@ -204,6 +215,7 @@ EXPERIMENTS = [
     (speed_error, 1e-9, 1e-6),
     (layouts_chord, 1e-9, 1e-6),
     (limits_cells, 5, 20),
+    (units_range, 98, 100),
 ]
 
 

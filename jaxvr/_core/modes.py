@@ -41,6 +41,16 @@ def constant(tree: Any, message: str) -> Any:
     return _floats(lambda x: _constant(x, message), tree)
 
 
+def once_by(x: jax.Array, tree: Any, message: str) -> jax.Array:
+    """`x`; raises TypeError(message) where it is differentiated with respect to `tree`.
+
+    In a rule for derivatives that is right for first ones only: `x` is what tangents are multiplied
+    by, held fixed, and `tree` what it would depend on were it not. Other derivatives of `x` go
+    through. (Not for tangents: in reverse mode JAX drops the rules of what is unknown.)
+    """
+    return _once_by(x, jax.tree.leaves(tree), message)
+
+
 @contextlib.contextmanager
 def custom_vjp_refused(message: str) -> Iterator[None]:
     """Round a call of a function with a `custom_vjp`: JAX's error of forward mode becomes
@@ -66,6 +76,23 @@ def _constant(x: jax.Array, message: str) -> jax.Array:
 @_constant.defjvp
 def _constant_jvp(message: str, primals: Any, tangents: Any) -> Any:
     raise TypeError(message)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _once_by(x: jax.Array, leaves: Any, message: str) -> jax.Array:
+    return x
+
+
+def _once_by_jvp(message: str, primals: Any, tangents: Any) -> Any:
+    x_dot, leaves_dot = tangents
+    if not all(isinstance(t, jax.custom_derivatives.SymbolicZero) for t in leaves_dot):
+        raise TypeError(message)
+    if isinstance(x_dot, jax.custom_derivatives.SymbolicZero):
+        x_dot = jnp.zeros_like(primals[0])
+    return primals[0], x_dot
+
+
+_once_by.defjvp(_once_by_jvp, symbolic_zeros=True)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))

@@ -14,8 +14,22 @@ import numpy as np
 LOST = 1
 STEPS = 2
 K_TOO_SMALL = 4
+LENGTHS = 64
+SCALARS = 128
 
-_MEANING = {
+_MEANING = {  # what explains others first
+    LENGTHS: (
+        "The lengths are too small or too large for the dtype.",
+        "The largest coordinate of the points has to lie between 2^-100 = 7.9e-31 and 2^100 = "
+        "1.3e30 in float32, 2^-960 = 1e-289 and 2^960 = 1e289 in float64. Take another unit of "
+        "length, for points, camera and extinctions (which are one over a length), or float64.",
+    ),
+    SCALARS: (
+        "The scalars are too small for the dtype.",
+        "The largest of the field and the control points has to be at least 2^-100 = 7.9e-31 in "
+        "float32, 2^-960 = 1e-289 in float64. Take another unit, for `values` and for the "
+        "transfer function's `positions`, or float64.",
+    ),
     LOST: (
         "found no way out of a cell",
         "Its coordinates are NaN or infinite, or the ray is: check `points`, the camera and what "
@@ -48,6 +62,8 @@ def check(status: Any) -> None:
         return
     for bit, (what, advice) in _MEANING.items():
         hit = (bits & bit) != 0
+        if hit.any() and bit in (LENGTHS, SCALARS):  # of the whole picture
+            raise RenderError(f"{what} {advice}")
         if hit.any():
             first = tuple(int(i) for i in np.argwhere(hit)[0])
             raise RenderError(

@@ -33,6 +33,7 @@ from jaxvr.arguments import (
     volume_of,
 )
 from jaxvr.composite import Over
+from jaxvr.defaults import diagonal
 from jaxvr.fit.batches import Batch, Views, deal, gather_views, listed, make_batches, pictures_of
 from jaxvr.fit.loop import Control, batch_number, run
 from jaxvr.fit.losses import loss_of
@@ -139,13 +140,15 @@ def fit(
     )
     seen, unseen = every.parted(number_seen)
     dtype = seen.targets.dtype
-    parameters = Parameters.of(transfer.astype(dtype), free)
+    # A length to measure extinctions by, where the start has none.
+    size = max(float(c.length.max()) for c in cameras) if volume is None else diagonal(volume)
+    parameters = Parameters.of(transfer.astype(dtype), free, size)
     dealt = deal(seen, rays, views, seed)
     batches, places = make_batches(seen, dealt)
     objective = Objective(loss_of(loss), *_settled(nouns, dtype, cache))
     weights = [_schedule(n, w) for n, w in _weights(smoothness, smoothness_extinctions)]
     mean = jnp.mean(parameters.transfer.extinctions)
-    unit = jnp.where(mean > 0, mean, 1).astype(dtype)
+    unit = jnp.where(mean > 0, mean, 1 / size).astype(dtype)
     fixed = parameters, unit, None if cache else volume, background
 
     def inputs(iteration: int) -> tuple[Any, ...]:

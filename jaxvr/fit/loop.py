@@ -106,7 +106,9 @@ def fit_parameters(
       batches: pytrees of arrays of one structure and shape. Each epoch takes every batch once, in
         an order that the seed decides.
       optimizer: any of optax; None is `optax.adam(learning_rate)`.
-      learning_rate: of Adam: a number, or a schedule from iteration to number.
+      learning_rate: of Adam: a number, or a schedule from iteration to number. Adam's first steps
+        are of that size in the parameters' own units: divide values, points and extinctions by
+        what they are to be seen in, or choose the rate by them.
       progress: a bar with the loss; None shows it only on a terminal.
       callback: called after every step with (iteration, loss, parameters); if it returns True,
         the fit ends there.

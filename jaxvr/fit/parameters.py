@@ -101,11 +101,15 @@ class Parameters:
     transforms: dict[str, Any]
 
     @staticmethod
-    def of(transfer: TransferFunction, free: Any = ("colors", "extinctions")) -> Parameters:
-        """Checked. `free`: names of fields, or a dict from name to transform.
+    def of(
+        transfer: TransferFunction, free: Any = ("colors", "extinctions"), size: float = 1.0
+    ) -> Parameters:
+        """Checked. `free`: names of fields, or a dict from name to transform. `size`: of the
+        volume, a length.
 
         Defaults: `Sigmoid()` for colours, `Softplus(unit)` for extinctions with the mean of those
-        that are positive as unit, `Ordered` for positions between the first and the last.
+        that are positive as unit (one over `size` if none is), `Ordered` for positions between the
+        first and the last.
         """
         names = [free] if isinstance(free, str) else list(free)
         if unknown := [n for n in names if n not in FIELDS]:
@@ -113,7 +117,7 @@ class Parameters:
         if not names:
             raise ValueError(f"free is empty: name some of {list(FIELDS)}.")
         given = free if isinstance(free, Mapping) else {}
-        transforms = {n: given[n] if n in given else _default(n, transfer) for n in names}
+        transforms = {n: given[n] if n in given else _default(n, transfer, size) for n in names}
         return Parameters(transfer, transforms)
 
     def raw(self) -> dict[str, Array]:
@@ -147,7 +151,7 @@ def noise(positions: Any, extinction: Any, seed: int = 0, *, dtype: Any = None) 
     return TransferFunction(positions, colors, extinctions, dtype=dtype)
 
 
-def _default(name: str, transfer: TransferFunction) -> Any:
+def _default(name: str, transfer: TransferFunction, size: float) -> Any:
     if name == "positions":
         first, last = transfer.positions[0], transfer.positions[-1]
         if not first < last:
@@ -155,7 +159,7 @@ def _default(name: str, transfer: TransferFunction) -> Any:
         return Ordered(first, last)
     if name == "extinctions":
         e = np.asarray(transfer.extinctions, np.float64)
-        unit = float(e[e > 0].mean()) if (e > 0).any() else 1.0
+        unit = float(e[e > 0].mean()) if (e > 0).any() else 1 / size
         return Softplus(jnp.asarray(unit, transfer.dtype))
     colors = np.asarray(transfer.colors)
     if colors.min() < 0 or colors.max() > 1:

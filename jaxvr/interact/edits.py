@@ -100,7 +100,7 @@ def padded(transfer: TransferFunction) -> TransferFunction:
     while size < len(x):
         size *= 2
     more = size - len(x)
-    step = max(float(x[-1]) - float(x[0]), abs(float(x[-1])), float(np.finfo(x.dtype).tiny))
+    step = max(float(x[-1]) - float(x[0]), abs(float(x[-1]))) or 1.0
     if more == 0 or not float(x[-1]) + step * more < float(np.finfo(x.dtype).max):
         return transfer
     above = (float(x[-1]) + step * np.arange(1, more + 1)).astype(x.dtype)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxvr._core.units import norm
 from jaxvr.view.camera import Camera
 
 # Straight up or down a picture has no upper side.
@@ -42,7 +43,7 @@ class Orbit:
         )
         axes = _axes(up)
         out = eye - target
-        distance = float(np.linalg.norm(out))
+        distance = norm(out)
         x, y, z = axes @ (out / distance)
         if camera.fov is not None:
             fov = float(camera.fov)
@@ -109,7 +110,7 @@ class Orbit:
 
 def _axes(up: np.ndarray) -> np.ndarray:
     """A right-handed frame (3, 3) whose second row is up: the world's own where up is y."""
-    y = up / np.linalg.norm(up)
+    y = up / norm(up)
     world = np.eye(3)[[2, 0, 1]]
     z = world[np.argmin(np.abs(world @ y))]
     z = z - (z @ y) * y

@@ -170,8 +170,9 @@ def slabs_of(table: Nodes) -> Array:
     equal = position[1:] == position[:-1]
     hard = jnp.zeros(count, dtype).at[:-1].max(equal).at[1:].max(equal)
     no = jnp.zeros(1, dtype)
-    inside = (low < high) & ~outermost
-    slope = jnp.where(inside, 1 / jnp.where(inside, high - low, 1), 0)
+    width = high - low
+    inside = (width > 0) & ~outermost
+    slope = jnp.where(inside, 1 / jnp.where(inside, width, 1), 0)
     first, second = table.optical[:, left], table.optical[:, right]
     floor, ceiling = jnp.concatenate([-infinite, position]), jnp.concatenate([position, infinite])
     dark = (first[0] == 0) & (second[0] == 0)

@@ -37,7 +37,9 @@ lower side's values at one end and the upper side's at the other. So moved toget
 jump, and moved apart they make a ramp: the derivative by each of the two is the one-sided one, in
 the only direction in which they may go apart, and their sum is that of the jump.
 
-First derivatives of whole segments are exact, second ones are not. At kinks (a scalar that stays
+First derivatives of whole segments are exact. So are second ones of which at most one is by the
+scalar (by values, points, camera or positions): the others, for which the moving place of a soft
+cut counts, are refused. At kinks (a scalar that stays
 exactly at a control point) the derivative is the one through the slab that the value was taken
 from. A scalar exactly at a jump belongs to the upper side, as in tf(s), at the ends of a segment as
 well: a segment crosses the jump at p if its lower end is below p and its upper end is at p or
@@ -54,11 +56,18 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxvr._core.modes import once_by
 from jaxvr._core.pytree import pytree, static
 from jaxvr.optics.transfer import TransferFunction
 
 Array = jax.Array
 _hold = lax.stop_gradient
+
+_SECOND = (
+    "Second derivatives by values, points, camera and positions of control points are given by no "
+    "adjoint, since places of cuts are held fixed. Take differences of first derivatives. Those by "
+    "colours and extinctions, and by one of these and anything else, are given by Direct()."
+)
 
 
 class Segment(NamedTuple):
@@ -107,9 +116,10 @@ class Piece(NamedTuple):
     t (2, R): where the piece starts and ends, as fractions of the segment.
     place (2, R): the same ends as fractions of the slab, 0 at `left`.
     fraction (R,): its share of the segment's length.
-    slope (2, R): at a soft end 1 / width of the slab, 0 outside the control points; at a hard end 0.
-    rate (2, R): at a hard end, what its fraction loses for each unit by which the scalar runs ahead
-    of the border there, 1 / (s_b - s_f) at the piece's end and minus that at its start; else 0.
+    slope (2, R): at a soft end 1 / width of the slab, 0 outside the control points; at a hard end
+    0. rate (2, R): at a hard end, what its fraction loses for each unit by which the scalar runs
+    ahead of the border there, 1 / (s_b - s_f) at the piece's end and minus that at its start;
+    else 0.
     """
 
     left: Array
@@ -246,8 +256,9 @@ def cut(nodes: Nodes, segment: Segment, cursor: Cursor) -> tuple[Piece, Cursor, 
     per_scalar = 1 / jnp.where(flat, 1, change)
     fraction = jnp.where(flat, 1.0, (end - scalar) * per_scalar)
     fraction = jnp.where(astray | jump, 0.0, fraction)
-    inside = ~(outermost | jump | astray)
-    slope = jnp.where(inside, 1 / jnp.where(inside, high - low, 1), 0.0)
+    width = high - low
+    inside = (width > 0) & ~(outermost | astray)
+    slope = jnp.where(inside, 1 / jnp.where(inside, width, 1), 0.0)
 
     def place(at: Array, in_jump: Array) -> Array:
         return jnp.where(jump, in_jump.astype(at.dtype), (at - low) * slope)
@@ -308,10 +319,12 @@ def _moving(place, fraction, t, slope, rate, front, back, position):
 @_moving.defjvp
 def _moving_jvp(primals, tangents):
     # m of the module's text, at both ends of the piece.
-    place, fraction, t, slope, rate, *_ = primals
+    place, fraction, t, slope, rate, *scalars = primals
     *_, d_front, d_back, d_position = tangents
     ahead = (1 - t) * d_front[None] + t * d_back[None]
     ahead = ahead - (1 - place) * d_position[:1] - place * d_position[1:]
+    # Asked of what is known in reverse mode, too: rules of tangents are dropped there.
+    slope, rate = (once_by(x, scalars, _SECOND) for x in (slope, rate))
     return (place, fraction), (ahead * slope, -jnp.sum(ahead * rate, 0))
 
 

@@ -36,6 +36,7 @@ class TransferFunction:
     """A piecewise linear map from scalars to colours and extinctions, with K control points.
 
     positions (K,):   scalar values, never decreasing; two equal ones are a jump, three an error.
+        However near two others are, they are none.
     colors (K, 3):    linear RGB; any finite number (above 1 for lights brighter than white).
         Integers above 1 are an error, since they are taken for 8-bit colours.
     extinctions (K,): per unit of length, >= 0, any size.

@@ -10,7 +10,8 @@ Here
 
 - faces seen edge-on, to within rounding in float64, relate nothing, and cells that lie the wrong
   way round among their neighbours (folds) count as the right way round, as on a walk: rays go
-  through them backwards, so there the order is that of the cells and depths are not sorted.
+  through them backwards, so there the order is that of the cells and depths are not sorted. So do
+  cells without volume, and cells that moved points have turned over.
 - cells are not drawn but their faces are. A face goes with the cell behind it, an exit after its
   cell. Along a ray cells grow in rank, and so do its faces.
 
@@ -35,8 +36,7 @@ from jaxvr.order.gaps import View, across_gaps, expand, look
 from jaxvr.order.keys import AbstractOrder
 from jaxvr.view import Camera
 from jaxvr.volume import TetMesh, packing
-from jaxvr.volume.connectivity import FACES
-from jaxvr.volume.geometry import signed_volumes
+from jaxvr.volume.connectivity import FACES, orientations
 
 _CELLS = 1 << 18  # at once, where sides are found
 _BOUND = 16 * 2.0**-53  # orient3d (see `volume.geometry`) and the rounding of a direction of view
@@ -85,7 +85,8 @@ def exact_order(mesh: TetMesh, camera: Camera) -> ExactOrder:
         raise ValueError("exact_order needs to know the numbers: call it outside of jit and grad.")
     cells, words = np.asarray(mesh.cells), np.asarray(mesh.neighbors)
     view = look(mesh, camera)
-    side = _sides(view, cells, words, _orientations(view.points, cells, words, mesh.boundary))
+    tau = orientations(words, np.asarray(mesh.boundary))[0]
+    side = _sides(view, cells, words, tau)
     front, k = np.nonzero((side > 0) & (words >= 0))
     back = packing.cell_of(words[front, k])
     exits, entries = across_gaps(view, mesh, float(np.finfo(mesh.dtype).eps))
@@ -102,15 +103,6 @@ def _table(rank: np.ndarray, side: np.ndarray, words: np.ndarray) -> np.ndarray:
     behind = np.where(side > 0, other, np.where(side < 0, own, np.maximum(own, other)))
     last = (words < 0) & (side >= 0)
     return (2 * behind + last).astype(np.int32).reshape(-1)
-
-
-def _orientations(points: np.ndarray, cells: np.ndarray, words: np.ndarray, boundary) -> np.ndarray:
-    """tau (T,) int8 of `TetMesh.boundary`: of a cell as the mesh would be unfolded."""
-    turned = np.zeros(len(cells), bool)
-    for word in (words[words >= 0], np.asarray(boundary)):
-        turned[packing.cell_of(word)] = packing.turned_of(word)
-    sign = signed_volumes(points, cells)[1]
-    return np.where(turned, -sign, sign)
 
 
 def _sides(view: View, cells: np.ndarray, words: np.ndarray, tau: np.ndarray) -> np.ndarray:

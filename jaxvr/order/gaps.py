@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxvr._core.units import norm, scaled_to_one
 from jaxvr.view import Camera
 from jaxvr.volume import TetMesh, packing
 from jaxvr.volume.connectivity import FACES
@@ -54,8 +55,8 @@ def look(mesh: TetMesh, camera: Camera) -> View:
     else:
         assert camera.extent is not None
         forward, high = directions[0], np.ldexp(float(camera.extent), -exponent) / 2
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, np.asarray(camera.up, np.float64))
+    forward = forward / norm(forward)
+    right = np.cross(forward, scaled_to_one(np.asarray(camera.up))[0])
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(right, forward), forward])
     x, y, z = _along(axes, directions if pinhole else origins - eye)

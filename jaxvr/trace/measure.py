@@ -24,6 +24,7 @@ import numpy as np
 from jax import lax
 
 from jaxvr._core.checks import is_concrete
+from jaxvr._core.units import require_lengths
 from jaxvr.order import AbstractOrder, Centroid
 from jaxvr.trace.faces import CellFaces, cell_faces
 from jaxvr.trace.scene import make_scene
@@ -96,6 +97,7 @@ def measure_k(
         raise ValueError(
             f'direction must be "front to back" or "back to front", but is {direction!r}.'
         )
+    require_lengths("volume.points", volume.points)
     camera = jax.tree.map(lambda x: jnp.asarray(x).astype(volume.dtype), camera)
     rays, count = batches(batch_size(volume.dtype), tuple(tile(x) for x in camera.rays()))
     source = _prepare(volume)

@@ -27,6 +27,7 @@ from jaxvr._core.checks import (
 )
 from jaxvr._core.gather import take
 from jaxvr._core.pytree import pytree, static
+from jaxvr._core.units import require_lengths
 from jaxvr.order import AbstractOrder, Centroid
 from jaxvr.trace.face import crossing, opposite_edges, sizes_of
 from jaxvr.trace.scene import coordinates_of, scale_of
@@ -121,7 +122,8 @@ def rasterize(
 
     Raises:
       ValueError: for wrong shapes, indices out of range, a triangle with a point twice, NaN or
-        infinite numbers, 2^31 fragments or more. Not for use inside `jit`: how many there are
+        infinite numbers, lengths out of the range that `jaxvr.units` states, 2^31 fragments or
+        more. Not for use inside `jit`: how many there are
         decides the result's shape.
 
     Triangles share an edge if they share its two point ids. Where they only have points at the same
@@ -137,6 +139,7 @@ def rasterize(
     points = as_floats("points", points, ndim=2, dtype=dtype)
     require_shape("points", points, (None, 3))
     require_finite("points", points)
+    require_lengths("points", points)
     values = np.zeros(len(points)) if values is None else values
     values = as_floats("values", values, ndim=1, dtype=dtype)
     require_shape("values", values, (len(points),))

@@ -19,9 +19,13 @@ projects that vertex only. Nothing depends on the camera but the entry points.
 What is defined for input that intersects itself: a path from entry to exit is composited whole, and
 paths in the order of their entry depth. A cell that is inverted against its neighbours (a fold) is
 walked backwards in depth, contributes its chord like any other cell, and stands in the path where
-the connectivity has it. A few cells round such a fold can form a closed ring that a ray pierces
-without touching the boundary; a walk from the boundary does not reach it, and it is left out. On
-the crushed can of the VTK data (77 inverted cells in 28,800) that is one ray in 700.
+the connectivity has it. A cell that only moved points or rounding turned over (`turned` is 0) does
+not: the ray waits at the depth that it has reached, and what follows is cut off there, so chords go
+on adding up to the distance from entry to exit (`local.make_segment`).
+
+A few cells round a fold can form a closed ring that a ray pierces without touching the boundary; a
+walk from the boundary does not reach it, and it is left out. On the crushed can of the VTK data (77
+inverted cells in 28,800) that is one ray in 700.
 """
 
 from __future__ import annotations

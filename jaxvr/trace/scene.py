@@ -14,11 +14,11 @@ import itertools
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from jaxvr._core.gather import load, take
 from jaxvr._core.pytree import pytree, static
 from jaxvr._core.stage import stage
+from jaxvr._core.units import near_one
 from jaxvr.trace.shear import ShearedRays, shear_points
 from jaxvr.volume.mesh import TetMesh
 
@@ -77,9 +77,7 @@ def make_scene(mesh: TetMesh) -> Scene:
 
 def scale_of(points: Array) -> Array:
     """The power of two () that brings the largest coordinate of points (P, 3) to [1/2, 1)."""
-    largest = jnp.max(jnp.abs(lax.stop_gradient(points)))
-    exponent = jnp.where(largest > 0, -jnp.frexp(jnp.where(largest > 0, largest, 1))[1], 0)
-    return jnp.ldexp(jnp.ones((), points.dtype), exponent)
+    return near_one(points)
 
 
 def merged_points(mesh: TetMesh) -> Array:

@@ -32,6 +32,7 @@ from jaxvr._core.checks import (
 )
 from jaxvr._core.pytree import pytree, static
 from jaxvr._core.stage import stage
+from jaxvr._core.units import near_one
 
 Array = jax.Array
 
@@ -136,7 +137,9 @@ class Camera:
         _require_between("zoom", magnification, 0.0, math.inf)
         corners = [jnp.asarray(as_floats("bounds", c, ndim=1, dtype=dtype)) for c in (lo, hi)]
         target = 0.5 * (corners[0] + corners[1])
-        radius = 0.5 * jnp.linalg.norm(corners[1] - corners[0])
+        diagonal = corners[1] - corners[0]
+        unit = near_one(diagonal)
+        radius = 0.5 * jnp.linalg.norm(diagonal * unit) / unit
         distance = radius / jnp.sin(jnp.deg2rad(angle) / 2) / magnification
         az, el = jnp.deg2rad(az), jnp.deg2rad(el)
         outward = jnp.stack([jnp.cos(el) * jnp.sin(az), jnp.sin(el), jnp.cos(el) * jnp.cos(az)])
@@ -235,8 +238,10 @@ class Camera:
 
     def basis(self) -> tuple[Array, Array, Array]:
         """The unit vectors right, true_up and forward, (3,) each."""
-        forward = _normalize(self.target - self.eye)
-        right = _normalize(jnp.cross(forward, self.up))
+        # By powers of two near 1, where squares neither under- nor overflow.
+        ahead = self.target - self.eye
+        forward = _normalize(ahead * near_one(ahead))
+        right = _normalize(jnp.cross(forward, self.up * near_one(self.up)))
         return right, jnp.cross(right, forward), forward
 
     def rays(self) -> tuple[Array, Array]:

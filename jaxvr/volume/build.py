@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from .._core.checks import as_floats, default_float, float_dtype, is_concrete, require_finite
+from .._core.units import scaled_to_one
 from . import cells as zoo
 from . import connectivity as conn
 from .geometry import flat_cells, signed_volumes
@@ -251,8 +252,8 @@ def _require_order(
 
 def _collapsed(given: Any, pts: np.ndarray, tets: np.ndarray) -> int:
     """How many of these cells without volume (N, 4) have one in the points as they were given."""
-    exact = np.asarray(given, np.float64)
-    if pts.dtype == np.float64 or np.array_equal(exact, pts):
+    exact, _ = scaled_to_one(given)
+    if pts.dtype == np.float64 or np.array_equal(given, pts):
         return 0
     volume, _ = signed_volumes(exact, tets)
     return int((np.abs(volume) > _SOLID * _longest(exact, tets) ** 3).sum())

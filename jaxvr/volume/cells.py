@@ -11,7 +11,7 @@ of a central tetrahedron; it and the four corners that it leaves are 5 in all.
 
 "Smallest" is by welded id (see `weld`), ties by the place in the cell, so both sides of a seam of
 coincident points are cut alike. A cell with coincident vertices (a hexahedron collapsed to a wedge)
-needs no special case: its flat tetrahedra repeat a welded id and are dropped later.
+needs no special case: those of its tetrahedra that repeat a welded id are dropped later.
 Grids numbered along i, j, k always give 6, since there G is the largest vertex of each far face.
 """
 

@@ -5,8 +5,8 @@ order on both sides, and face k (opposite local vertex k) of a row (q0, q1, q2, 
 (-1)**k in the orientation that the row induces. Two neighbours c (face k) and n (face f) lie on
 opposite sides of the face exactly if o(c) o(n) = -(-1)**(k + f), o being the sign of a row's
 determinant. A mesh where that fails somewhere is folded; `combinatorial` finds the signs that it
-would have if it were not, which is what a walk through the cells has to go by. Cells without volume
-have no sign of their own; they get the one that fits their neighbours (`fill_signs`).
+would have if it were not, which is what a walk through the cells has to go by. Cells without
+volume have no sign of their own; they get the one that fits their neighbours (`fill_signs`).
 """
 
 from __future__ import annotations
@@ -189,6 +189,35 @@ def combinatorial(
     flip &= ~one_sided
     turned = flip[patch]
     return turned, len(np.unique(upright[one_sided]))
+
+
+def orientations(neighbors: np.ndarray, boundary: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """tau (T,) int8 of `TetMesh.boundary`, the orientation of each row as the mesh would be
+    unfolded, from the integers of a mesh alone, and the component (T,) of each cell.
+
+    Cells without volume have one as well, and moved points change nothing. It is 0 in components
+    without a boundary and in one-sided ones, which have none.
+    """
+    n = len(neighbors)
+    c, k = np.nonzero(neighbors >= 0)
+    words = neighbors[c, k]
+    m, f = packing.cell_of(words), packing.corner_of(words)
+    # two copies of each cell, of either sign; a face joins those that go together
+    other = (k + f) % 2 == 0
+    rows, cols = np.r_[c, c + n], np.r_[np.where(other, m + n, m), np.where(other, m, m + n)]
+    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, cols)), shape=(2 * n, 2 * n))
+    count, label = connected_components(graph, directed=False)
+    cell, sign = packing.cell_of(boundary), entry_signs(boundary)
+    known = np.zeros(count, np.int8)
+    known[label[np.where(sign > 0, cell, cell + n)]] = 1
+    up, down = known[label[:n]], known[label[n:]]
+    return (up - down).astype(np.int8), np.minimum(label[:n], label[n:])
+
+
+def entry_signs(boundary: np.ndarray) -> np.ndarray:
+    """tau (F,) int8 of the cells at the boundary, from its words."""
+    entry, odd = packing.flag_of(boundary), packing.corner_of(boundary) % 2
+    return np.where(entry == odd, 1, -1).astype(np.int8)
 
 
 def neighbor_words(rows: np.ndarray, pairs: np.ndarray, turned: np.ndarray) -> np.ndarray:

@@ -42,17 +42,17 @@ def signed_volumes(points: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np
 def flat_cells(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
     """Which tetrahedra (T,) bool have no volume beyond the rounding of their points (P, 3).
 
-    With d a bound on how far rounding may have moved any coordinate of the corners q_v, N_v twice
-    the area vector of the face opposite q_v and e the six edges, six volumes may have changed by
+    With d_v a bound on how far rounding may have moved any coordinate of the corner q_v, N_v twice
+    the area vector of the face opposite q_v and e_vw the edges, six volumes may have changed by
 
-        sum_v d |N_v|_1 + 2 d^2 sum_e |e|_1 + 24 d^3
+        sum_v d_v |N_v|_1 + 2 sum_{v<w} d_v d_w |e_xy|_1 + 6 sum_{u<v<w} d_u d_v d_w
 
-    and no more: the determinant of rows (q_v, 1) is linear in each row, and these are its terms
-    with one, two and three rows moved (with all four it is zero). d is four roundings of the
-    cell's largest coordinate, in any axis: points that were turned or sheared carry roundings of
-    the others. So a cell is flat if it is lower than a few units in the last place of where it is,
-    and which way round such a cell lies, its corners do not say. Numbers that float32 can hold are
-    taken to come from there, whatever the dtype is.
+    and no more, xy being the corners other than v and w: the determinant of rows (q_v, 1) is linear
+    in each row, and these are its terms with one, two and three rows moved (with all four it is
+    zero). d_v is four roundings of the largest coordinate of q_v, in any axis: points that were
+    turned or sheared carry roundings of the others. So a cell is flat if it is lower than a few
+    units in the last place of where it is, and which way round such a cell lies, its corners do not
+    say. Numbers that float32 can hold are taken to come from there, whatever the dtype is.
     """
     unit = float(np.finfo(points.dtype).eps) / 2
     with np.errstate(over="ignore"):
@@ -62,14 +62,18 @@ def flat_cells(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
     out = np.empty(len(tets), bool)
     for i in range(0, len(tets), _CHUNK):
         q = p[tets[i : i + _CHUNK]]
-        d = _ROUNDINGS * unit * np.abs(q).max((1, 2))
+        d = (_ROUNDINGS * unit * np.abs(q).max(2)).T
         a, b, c = np.moveaxis(q[:, 1:] - q[:, :1], 1, 0)
         ab, bc, ca = b - a, c - b, a - c
         normals = (np.cross(ab, bc), np.cross(b, c), np.cross(c, a), np.cross(a, b))
-        faces = sum(np.abs(n).sum(1) for n in normals)
-        edges = sum(np.abs(e).sum(1) for e in (a, b, c, ab, bc, ca))
-        det = np.abs((a * normals[1]).sum(1))
-        out[i : i + _CHUNK] = det <= d * (faces + d * (2 * edges + 24 * d))
+        across = (bc, ca, ab, c, b, a)  # of the pairs of corners below
+        pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+        bound = sum(x * np.abs(n).sum(1) for x, n in zip(d, normals, strict=True))
+        for (v, w), e in zip(pairs, across, strict=True):
+            bound += 2 * d[v] * d[w] * np.abs(e).sum(1)
+        for u, v, w in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)):
+            bound += 6 * d[u] * d[v] * d[w]
+        out[i : i + _CHUNK] = np.abs((a * normals[1]).sum(1)) <= bound
     return out
 
 

@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.checks import as_floats, require_finite, require_shape
+from .._core.checks import as_floats, is_concrete, require_finite, require_shape
 from .._core.pytree import pytree, static
 from .build import build
+from .mirror import mirrored
 from .report import MeshReport
 from .values import choose_location, place, rounded
 
@@ -43,8 +44,12 @@ class TetMesh:
 
     A cell is turned if its geometric orientation contradicts that of its neighbours, so that it
     overlaps them (a fold, as in a crushed mesh). The bit says how the cell lies in the mesh *as it
-    was built*: `replace(points=...)` keeps all integers, so it is right for moves that turn no cell
-    over and keep coincident points together; after larger ones, build the mesh anew.
+    was built*: `replace(points=...)` keeps it, so it is right for moves that turn no cell over and
+    keep coincident points together; after larger ones, build the mesh anew.
+
+    Cells may have no volume, or none beyond the rounding of their points: they keep the faces
+    beside them from being boundaries, and a ray passes them in no length. The same goes for cells
+    that moved points turn over: a ray waits in them where it is, until it gets farther again.
     """
 
     points: Array
@@ -78,8 +83,10 @@ class TetMesh:
         location: "point", "cell" or "corner"; `None` takes the one whose shape fits.
         dtype: float32 or float64; `None` takes float64 if x64 is on and points are, else float32.
 
-        Zoo cells are cut into tetrahedra that conform (see `cells`). Tetrahedra without volume are
-        dropped and inverted ones turned round, with one warning that counts both.
+        Zoo cells are cut into tetrahedra that conform (see `cells`). Tetrahedra that have a point
+        twice (by `weld`) are dropped, those without volume kept, since they close cracks, and
+        inverted ones turned round, with one warning that counts all three. Flat ones because of
+        which a face would have three cells are dropped, too.
 
         Raises ValueError for arrays of the wrong shape or kind, indices out of range, NaN or
         infinite numbers, an unknown cell type, cells that are mostly twisted as their nodes are in
@@ -124,11 +131,22 @@ class TetMesh:
         location is kept, or `location` says which. points (P, 3): see the class on what may move.
         Both are cast to the dtype of the points. Raises ValueError for other shapes and, outside
         tracing, for NaN or infinite entries.
+
+        Points that mirror the mesh (an axis with another sign, two axes swapped), or a part of it
+        that hangs together, turn all cells over: outside tracing that is seen at the boundary, and
+        its `entry` bits go with it. Where more than a quarter of the volume at the boundary is
+        turned over without that, a warning says how many cells are. Inside tracing nothing is.
         """
         new: dict[str, Any] = {}
         if points is not None:
             new["points"] = self._floats("points", points)
             require_shape("points", new["points"], self.points.shape)
+            if is_concrete(new["points"], self.cells, self.neighbors, self.boundary):
+                found, message = mirrored(new["points"], self.cells, self.neighbors, self.boundary)
+                if found is not None:
+                    new["boundary"] = jnp.asarray(found)
+                if message:
+                    warnings.warn(message, UserWarning, stacklevel=2)
         if values is not None:
             v = self._floats("values", values)
             sizes = {"point": (self.n_points,), "cell": (self.n_tets,), "corner": self.cells.shape}
@@ -206,10 +224,13 @@ def _from_cells(
     dtype: Any,
     field: str | None,
     stacklevel: int,
+    flat_before: bool = False,
 ) -> TetMesh:
+    """flat_before: flat cells among these have been warned of."""
     built = build(points, cells, dtype, field)
     placed, where = place(values, built, location)
-    for message in (built.report.warning(), rounded("values", values, placed.dtype)):
+    news = dataclasses.replace(built.report, flat=0) if flat_before else built.report
+    for message in (news.warning(), rounded("values", values, placed.dtype)):
         if message:
             warnings.warn(message, UserWarning, stacklevel=stacklevel)
     return cls(

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxvr._core.units import scaled_to_one
+
 _CHUNK = 1 << 18
 _EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
@@ -26,10 +28,13 @@ class Quality:
 
 def quality(points: Any, cells: Any) -> Quality:
     """The quality of points (P, 3), cells (T, 4) with T > 0; rows may have either orientation."""
-    p, tets = np.asarray(points, np.float64), np.asarray(cells)
+    # Angles need products of four lengths, volumes of three.
+    (p, exponent), tets = scaled_to_one(points), np.asarray(cells)
     parts = [_extremes(p[tets[i : i + _CHUNK]]) for i in range(0, len(tets), _CHUNK)]
     lo, hi, ratio, small, large, total = zip(*parts, strict=True)
-    return Quality(min(lo), max(hi), max(ratio), min(small), max(large), sum(total))
+    with np.errstate(over="ignore", under="ignore"):
+        volumes = [float(np.ldexp(x, 3 * exponent)) for x in (min(small), max(large), sum(total))]
+    return Quality(min(lo), max(hi), max(ratio), *volumes)
 
 
 def _extremes(q: np.ndarray) -> tuple[float, float, float, float, float, float]:

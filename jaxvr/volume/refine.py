@@ -34,7 +34,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._core.checks import is_concrete
-from .geometry import signed_volumes
+from .._core.units import scaled_to_one
+from .geometry import flat_cells, signed_volumes
 from .mesh import TetMesh, _from_cells
 from .packing import cell_of, corner_of
 from .weld import weld
@@ -62,7 +63,8 @@ def refine(mesh: TetMesh, share: float = 0.01, rounds: int = 3, deviation: float
     mesh with nothing to cut comes back as it is.
 
     An edge stays whole where its midpoint, rounded to the dtype of the points, would leave a cell
-    flat or turned over, or would fall on another point. Turned cells (see `TetMesh`) are cut as
+    flat or turned over, or would fall on another point. Cells that are flat already are cut with
+    those round them, into flat ones. Turned cells (see `TetMesh`) are cut as
     others are, and their halves are turned. The report goes on telling what was given and repaired
     when the mesh was built. Nothing is differentiated: refine outside `jit` and `grad`.
 
@@ -201,7 +203,9 @@ def _round(mesh: TetMesh, share: float, deviation: float) -> TetMesh:
         values = values[order]
     old, blocks = mesh.report, {"tetra": cells[order]}
     made = _from_cells(
-        TetMesh, points, blocks, values, mesh.location, mesh.dtype, old.field, stacklevel=4
+        *(TetMesh, points, blocks, values, mesh.location, mesh.dtype, old.field),
+        stacklevel=4,
+        flat_before=old.flat > 0,
     )
     report = dataclasses.replace(
         made.report,
@@ -209,6 +213,7 @@ def _round(mesh: TetMesh, share: float, deviation: float) -> TetMesh:
         reduced=old.reduced,
         ignored=old.ignored,
         degenerate=old.degenerate + made.report.degenerate,
+        crowded=old.crowded + made.report.crowded,
         inverted=old.inverted,
     )
     return dataclasses.replace(made, report=report)
@@ -220,12 +225,14 @@ def _keys(rows: np.ndarray) -> np.ndarray:
 
 
 def _longest(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The longest edge of each cell: its key (T,), of equals the lowest, and its length squared.
-    rows (T, 4): welded ids, whose order and coordinates all cells round an edge have in common."""
+    """The longest edge of each cell: its key (T,), of equals the lowest, and its length squared,
+    in a unit of its own. rows (T, 4): welded ids, whose order and coordinates all cells round an
+    edge have in common."""
+    points, _ = scaled_to_one(points)
     keys, squares = np.empty(len(rows), np.int64), np.empty(len(rows))
     for i in range(0, len(rows), _CHUNK):
         r = rows[i : i + _CHUNK]
-        q = points[r].astype(np.float64)
+        q = points[r]
         square = ((q[:, _EDGES[:, 1]] - q[:, _EDGES[:, 0]]) ** 2).sum(2)
         squares[i : i + _CHUNK] = most = square.max(1)
         best = square == most[:, None]
@@ -261,15 +268,15 @@ def _terminal_cuts(rows: np.ndarray, longest: np.ndarray, chosen: np.ndarray) ->
 
 
 def _possible(points: np.ndarray, welded: np.ndarray, cells: np.ndarray, cuts: _Cuts) -> np.ndarray:
-    """A mask of edges (E,): whether all halves lie as the whole cells do, and the midpoint falls on
-    no other point."""
+    """A mask of edges (E,): whether all halves lie as the whole cells do, unless those have no
+    volume, and the midpoint falls on no other point."""
     out = np.ones(int(cuts.edge.max(initial=-1)) + 1, bool)
     a, b, middle = _middles(len(points), cells, cuts)
     points = np.concatenate([points, _mean(points[a], points[b])])
     whole = cells[cuts.cell]
     halves = _halve(whole, cuts._replace(cell=np.arange(len(whole))), middle)
     sign = signed_volumes(points, halves)[1].reshape(2, -1)
-    same = (sign == signed_volumes(points, whole)[1]).all(0)
+    same = (sign == signed_volumes(points, whole)[1]).all(0) | flat_cells(points, whole)
     first = np.full(len(out), len(points))
     np.minimum.at(first, cuts.edge, middle)
     alone = weld(points)[0][middle] == first[cuts.edge]

@@ -27,6 +27,20 @@ def both(function):
     return [function(True), function(False)]
 
 
+def test_the_default_is_compiled(dtype):
+    """Where nothing is asked for, and not only where it is."""
+    assert native.missing(dtype) is None
+    mesh, camera = registry.mesh_of("point", dtype), registry.camera_of(dtype)
+
+    def loss(transfer):
+        return jaxvr.render(mesh, camera, transfer).sum()
+
+    code = jax.jit(jax.grad(loss)).lower(registry.transfer_of(dtype)).as_text()
+    for name in ("render", "render_pull"):
+        assert f"@jaxvr_{name}_{dtype}" in code
+    assert "stablehlo.while" not in code
+
+
 @pytest.fixture(scope="module")
 def layers():
     """Twelve plates with gaps between them: a ray enters more often than one search keeps."""

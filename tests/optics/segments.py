@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,10 +9,6 @@ import pytest
 import quick
 
 from jaxvr.optics import Segment, TransferFunction
-
-VECTORS = Path(
-    os.environ.get("JAXVR_VECTORS", Path(__file__).resolve().parents[3] / "shared" / "vectors")
-)
 
 TF = TransferFunction(
     np.array([0.1, 0.3, 0.5, 0.5, 0.8]),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxvr.optics import Analytic, Quadrature
-from tests.optics.segments import TF, VECTORS, colors_of, random_segments
+from tests.optics.segments import TF, colors_of, random_segments
 
 
 def error(rule, samples, depth):
@@ -38,9 +38,10 @@ def test_whole_segments():
     assert np.allclose(got, colors_of(Analytic(), TF, segment), rtol=0, atol=2e-14)
 
 
-def test_slab_against_vectors():
+@pytest.mark.outside("vectors/segment_vectors_public.npz")
+def test_slab_against_vectors(data_path):
     """Slabs of moderate depth: beyond, a fixed rule does not see where the light comes from."""
-    data = np.load(VECTORS / "segment_vectors_public.npz")
+    data = np.load(data_path("vectors/segment_vectors_public.npz"))
     depth = 0.5 * (data["tau_f"] + data["tau_b"]) * data["l"]
     rows = depth < 10
     assert rows.sum() > 1000

@@ -234,6 +234,7 @@ def test_damaged_files(tmp_path, suffix):
         attempt(path)
 
 
+@pytest.mark.outside("football_zoo.vtu")
 def test_truncated_real_file(data_path, tmp_path):
     raw = data_path("football_zoo.vtu").read_bytes()
     path = tmp_path / "cut.vtu"

@@ -26,6 +26,9 @@ COUNTS = {
 WARNS = {"bluntfin": "115 degenerate", "bluntfin_merged": "1 degenerate", "can": "77 inverted"}
 
 
+NAMED = [pytest.param(name, marks=pytest.mark.outside(f"{name}.vtu")) for name in COUNTS]
+
+
 @pytest.fixture(scope="module")
 def load(data_path):
     cache: dict[str, TetMesh] = {}
@@ -44,7 +47,7 @@ def load(data_path):
     return get
 
 
-@pytest.mark.parametrize("name", COUNTS)
+@pytest.mark.parametrize("name", NAMED)
 def test_counts(load, name):
     mesh = load(name)
     r = mesh.report
@@ -61,7 +64,7 @@ def test_counts(load, name):
     assert r.tets == mesh.n_tets
 
 
-@pytest.mark.parametrize("name", COUNTS)
+@pytest.mark.parametrize("name", NAMED)
 def test_invariants(load, name):
     """What a walk relies on, vectorised."""
     mesh = load(name)
@@ -96,6 +99,7 @@ def test_invariants(load, name):
     assert np.array_equal(packing.flag_of(b).astype(bool), entry)
 
 
+@pytest.mark.outside("bluntfin.vtu", "bluntfin_merged.vtu")
 def test_blunt_fin_with_and_without_its_duplicates_is_the_same_volume(load):
     one, two = load("bluntfin"), load("bluntfin_merged")
     a, b = quality(one.points, one.cells), quality(two.points, two.cells)
@@ -104,6 +108,7 @@ def test_blunt_fin_with_and_without_its_duplicates_is_the_same_volume(load):
     assert a.edge_ratio == pytest.approx(2648, abs=1)
 
 
+@pytest.mark.outside("oxygen_post.vtu")
 def test_seam_of_the_oxygen_post_is_closed_and_keeps_both_sides(load):
     mesh = load("oxygen_post")
     seam = (np.asarray(mesh.neighbors) >= 0) & (packing.flag_of(np.asarray(mesh.neighbors)) == 1)
@@ -113,12 +118,14 @@ def test_seam_of_the_oxygen_post_is_closed_and_keeps_both_sides(load):
     assert used.all()
 
 
+@pytest.mark.outside("post_tets.vtu")
 def test_crack_of_the_post_stays_open(load):
     """Points coincide along the crack, but no face has the same three on both sides."""
     mesh = load("post_tets")
     assert mesh.report.duplicate_points == 88 and mesh.report.seams == 0
 
 
+@pytest.mark.outside("can.vtu")
 def test_folds_of_the_can(load):
     mesh = load("can")
     words = np.asarray(mesh.neighbors)
@@ -128,6 +135,7 @@ def test_folds_of_the_can(load):
     assert len(turned) == 77
 
 
+@pytest.mark.outside("football_zoo.vtu", "can.vtu")
 def test_cell_data_of_a_zoo(data_path):
     mesh = read_mesh(data_path("football_zoo.vtu"), "scalar1")
     assert mesh.location == "cell" and mesh.values.shape == (2028,)
@@ -136,6 +144,7 @@ def test_cell_data_of_a_zoo(data_path):
         assert read_mesh(can, "EQPS").location == "cell"
 
 
+@pytest.mark.outside("cylinder_tets.vtu", "cylinder_tetra10.vtu")
 def test_quadratic_cells_are_their_linear_ones(load):
     linear, quadratic = load("cylinder_tets"), load("cylinder_tetra10")
     assert quadratic.report.reduced == (("tetra10", 1522),)

@@ -163,17 +163,17 @@ def test_inverted_and_degenerate_cells_are_repaired_with_one_warning():
     assert np.array_equal(mesh.values, [0.0, 1.0])
 
 
-def test_flat_cells_go_however_large_or_small():
+def test_flat_cells_stay_however_large_or_small(dtype):
     for scale in (1e-12, 1.0, 1e12):
         flat = (
             np.array([[0.1, 0.3, 0.7], [1.1, 0.3, 0.7], [0.1, 1.3, 0.7], [0.9, 0.8, 0.7]]) * scale
         )
-        points = np.concatenate([flat, [[0.2, 0.2, 5.0 * scale]]])
-        with pytest.warns(UserWarning, match="1 degenerate"):
-            mesh = TetMesh.from_cells(
-                points, {"tetra": [[0, 1, 2, 3], [0, 1, 2, 4]]}, np.ones(5), location="point"
-            )
-        assert mesh.n_tets == 1
+        points = np.concatenate([flat, [[0.2 * scale, 0.2 * scale, 5.0 * scale]]])
+        cells = {"tetra": [[0, 1, 2, 3], [0, 1, 2, 4]]}
+        with pytest.warns(UserWarning, match="^1 flat tetrahedra .* kept, of 2"):
+            mesh = TetMesh.from_cells(points, cells, np.ones(5), location="point", dtype=dtype)
+        assert (mesh.n_tets, mesh.n_boundary) == (2, 6)
+        assert (mesh.report.flat, mesh.report.degenerate, mesh.report.folded) == (1, 0, 0)
 
 
 def test_collapsed_hexahedra_become_wedges():

@@ -186,6 +186,8 @@ static void pull_block(Group *group, int64_t first) {
     if (group->vertices || task->rays_bar) pull_cells(lanes, n, group->bar);
     if (group->vertices)
       scatter_cells(&world->mesh, lanes, n, group->bar, group->vertices, group->values);
+    if (group->vertices || task->rays_bar)
+      pull_starts(&world->mesh, block, group->bar, group->vertices);
     leave(&world->mesh, lanes, n);
     settle(world, block, ALL_ROWS, optics->enough, keep_bars, group);
   }

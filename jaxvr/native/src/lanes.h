@@ -15,27 +15,33 @@ enum { VX, VY, VZ, VLOW, VVALUE, VERTEX }; /* rows of a vertex, see trace/shear.
 
 /* Rows of numbers. FACE: three vertices of the entry face; WEIGHT: their barycentric weights;
  * APEX: the fourth vertex; LEAVE: weights of the exit face's vertices, OF_B and OF_C: barycentric
- * coordinates of the last two. RECORD: the numbers of the slab that SLAB names. SUMS: compensated
- * optical depth and r, g, b, totals first. For derivatives, FINAL and PIXEL: those sums at the ray's
- * end and the pixel's cotangent; SBAR, RBAR, TBAR: cotangents of the segment's front, back and
- * length, of the ray's origin, S_x, S_y and stretch, and of the slab's control points. */
+ * coordinates of the last two. DEPTH: how far the ray has come; LEAD: by how much farther that is
+ * than the face it stands in, 0 but behind overturned cells, and CUT: what that was at the segment's
+ * entry, see make_segment of trace/local.py. RECORD: the numbers of the slab that SLAB names. SUMS:
+ * compensated optical depth and r, g, b, totals first. For derivatives, FINAL and PIXEL: those sums
+ * at the ray's end and the pixel's cotangent; SBAR, RBAR, TBAR: cotangents of the segment's front,
+ * back and length, of the ray's origin, S_x, S_y and stretch, and of the slab's control points. */
 enum {
   ORIGIN, SHEAR_X = ORIGIN + 3, SHEAR_Y = SHEAR_X + 3, SIGN = SHEAR_Y + 3, STRETCH,
   FACE, WEIGHT = FACE + 3 * VERTEX, APEX = WEIGHT + 3, LEAVE = APEX + VERTEX,
-  OF_B = LEAVE + 3, OF_C, DEPTH, FRONT = DEPTH + 2, BACK, LENGTH, CURSOR, RECORD,
+  OF_B = LEAVE + 3, OF_C, DEPTH, LEAD = DEPTH + 2, CUT, FRONT, BACK, LENGTH, CURSOR, RECORD,
   SUMS = RECORD + SLAB_NUMBERS, ROWS = SUMS + 8,
   FINAL = ROWS, PIXEL = FINAL + 8, SBAR = PIXEL + 4, RBAR = SBAR + 3, TBAR = RBAR + 6,
   ALL_ROWS = TBAR + NODE_PAIR
 };
 enum { A = FACE, B = FACE + VERTEX, C = FACE + 2 * VERTEX };
-/* Rows of integers. FRESH: the segment does not start where the one before has ended, in scalar. */
+/* Rows of integers. REACHED, CUT_AT: where LEAD or CUT is not 0, the word of the face where the
+ * depth was reached. FRESH: the segment does not start where the one before has ended, in scalar. */
 enum {
-  RAY, AXES, WORD = AXES + 3, POINT, POSITIVE, DROP, SLAB, FRESH, NEXT, END, LOST, SLOT, INTEGERS
+  RAY, AXES, WORD = AXES + 3, POINT, POSITIVE, DROP, REACHED, CUT_AT, SLAB, FRESH, NEXT, END, LOST,
+  SLOT, INTEGERS
 };
 
+/* leads: whether any LEAD may not be 0; cuts: whether CUT has been written for these segments. */
 typedef struct {
   _Alignas(64) real row[ALL_ROWS][LANES];
   _Alignas(64) int32_t integer[INTEGERS][LANES];
+  int leads, cuts;
 } Lanes;
 
 static inline void move_lane(Lanes *lanes, int rows, int from, int to) {

@@ -5,6 +5,7 @@
 
 #include "scene.h"
 #include "shade.h"
+#include "walk.h"
 
 /* Composites m pieces and takes the pixel's cotangent back to TBAR, the ends of the lanes' slabs,
  * and to SBAR, the segments. */
@@ -101,9 +102,9 @@ INLINE Pulled pull_crossing(const real a[VERTEX], const real b[VERTEX], const re
 }
 
 /* Cotangents of the four vertices of the lanes' cells, a, b, c and the apex: x, y, z in the ray's
- * axes, and the scalar. */
+ * axes, and the scalar. start: of the depth where a segment starts that is cut off at one. */
 typedef struct {
-  _Alignas(64) real of[4][4][LANES], share[2][LANES];
+  _Alignas(64) real of[4][4][LANES], share[2][LANES], start[LANES];
 } CellBar;
 
 /* Shares of b and c in the entry crossings. */
@@ -126,7 +127,8 @@ static void entry_shares(Lanes *lanes, int n, real share[2][LANES]) {
   }
 }
 
-static void pull_cells(Lanes *lanes, int n, CellBar *bar) {
+/* cuts: whether any segment may be cut off at a depth reached before, by CUT. */
+INLINE void pull_cells_by(Lanes *lanes, int n, CellBar *bar, const int cuts) {
   real(*row)[LANES] = lanes->row;
   entry_shares(lanes, n, bar->share);
   LANES_LOOP
@@ -146,24 +148,42 @@ static void pull_cells(Lanes *lanes, int n, CellBar *bar) {
              in_c, &zi, &zi_low, &si);
     crossing(p[VZ], p[VLOW], p[VVALUE], q[VZ], q[VLOW], q[VVALUE], d[VZ], d[VLOW], d[VVALUE], out_q,
              out_d, &zo, &zo_low, &so);
-    /* The segment: from its cotangents to those of the two crossings, see make_segment. */
+    /* The segment: from its cotangents to those of the two crossings, see make_segment. It starts
+     * at depth z0 with the scalar s0. */
     real front_bar = row[SBAR][i], back_bar = row[SBAR + 1][i], length_bar = row[SBAR + 2][i];
-    real advance = (zo - zi) + (zo_low - zi_low), chord = PICK(turned, -advance, advance);
-    word_t proper = MASK(chord > 0);
-    real z0 = zi + zi_low, z1 = PICK(proper, zo + zo_low, z0);
-    word_t behind0 = MASK(z0 < 0), behind1 = MASK(z1 < 0), cuts = behind0 ^ behind1;
-    real whole = PICK(cuts, z1 - z0, 1), t = -z0 / whole, difference = so - si;
-    real kept = PICK(behind0 | ~proper, 0, chord), length = PICK(cuts, most(z0, z1), kept);
+    real lead = cuts ? row[CUT][i] : 0;
+    real through = (zo - zi) + (zo_low - zi_low), advance = through - lead;
+    real chord = PICK(turned, -advance, advance), z0 = (zi + zi_low) + lead;
+    word_t proper = MASK(chord > 0), near = MASK(chord > -ROUNDING);
+    word_t cut = cuts ? MASK(lead != 0) & proper : 0;
+    real place = cuts ? lead / PICK(MASK(through == 0), 1, through) : 0;
+    real share = cuts ? PICK(cut, least(most(place, 0), 1), 0) : 0;
+    real s0 = cuts ? si + (so - si) * share : si;
+    real z1 = PICK(proper, zo + zo_low, z0);
+    word_t behind0 = MASK(z0 < 0), behind1 = MASK(z1 < 0), cut_off = behind0 ^ behind1;
+    real whole = PICK(cut_off, z1 - z0, 1), t = -z0 / whole, difference = so - s0;
+    real kept = PICK(behind0 | ~proper, 0, chord), length = PICK(cut_off, most(z0, z1), kept);
     real scaled = length_bar * row[STRETCH][i];
-    real along = PICK(behind0 | ~proper, 0, PICK(turned, -scaled, scaled));
+    real along = PICK(behind0 | ~near, 0, PICK(turned, -scaled, scaled));
     real cut_bar = PICK(behind0, front_bar, back_bar); /* of the scalar at the eye */
     real t_bar = cut_bar * difference / (whole * whole);
     word_t later = MASK(z1 > z0);
-    real zi_bar = PICK(cuts, PICK(later, 0, scaled) - t_bar * z1, -along);
-    real zo_bar = PICK(cuts, PICK(later, scaled, 0) + t_bar * z0, along);
+    real zi_bar = PICK(cut_off, PICK(later, 0, scaled) - t_bar * z1, -along);
+    real zo_bar = PICK(cut_off, PICK(later, scaled, 0) + t_bar * z0, along);
     real si_cut = PICK(behind0, front_bar * (1 - t), front_bar + back_bar * (1 - t));
     real so_cut = PICK(behind0, back_bar + front_bar * t, back_bar * t);
-    real si_bar = PICK(cuts, si_cut, front_bar), so_bar = PICK(cuts, so_cut, back_bar);
+    real si_bar = PICK(cut_off, si_cut, front_bar), so_bar = PICK(cut_off, so_cut, back_bar);
+    if (cuts) {
+      /* s0 = si + (so - si) share, share = (z0 - zi) / (zo - zi), and z0 is another face's. */
+      word_t inside = cut & MASK(place > 0) & MASK(place < 1);
+      real slope = PICK(inside, si_bar * (so - si) / PICK(inside, through, 1), 0);
+      word_t led = MASK(lead != 0);
+      bar->start[i] = PICK(led, zi_bar + slope, 0);
+      zi_bar = PICK(led, -slope * (1 - share), zi_bar);
+      zo_bar -= slope * share;
+      so_bar += si_bar * share;
+      si_bar -= si_bar * share;
+    }
     /* The crossings: to the faces' vertices. */
     word_t positive = MASK(lanes->integer[POSITIVE][i] != 0);
     real area = (row[WEIGHT][i] + row[WEIGHT + 1][i]) + row[WEIGHT + 2][i];
@@ -190,6 +210,40 @@ static void pull_cells(Lanes *lanes, int n, CellBar *bar) {
     row[RBAR + 3][i] -= sign * (in.x * zi + out.x * zo);
     row[RBAR + 4][i] -= sign * (in.y * zi + out.y * zo);
     row[RBAR + 5][i] += length_bar * length;
+  }
+}
+
+static void pull_cells(Lanes *lanes, int n, CellBar *bar) {
+  if (lanes->cuts) pull_cells_by(lanes, n, bar, 1);
+  else pull_cells_by(lanes, n, bar, 0);
+}
+
+/* Takes the cotangents of depths where segments were cut off to the faces that those are of. */
+static void pull_starts(const Mesh *mesh, Block *block, const CellBar *bar, real *vertices) {
+  Lanes *lanes = &block->lanes;
+  for (int i = 0; lanes->cuts && i < block->n; i++) {
+    if (lanes->row[CUT][i] == 0 || bar->start[i] == 0 || lanes->integer[LOST][i]) continue;
+    const Ray *ray = block->rays + lanes->integer[SLOT][i];
+    int word = lanes->integer[CUT_AT][i], cell = word >> 4, corner = word & 3;
+    FaceSeen face;
+    see_face(mesh, ray, cell, corner, &face);
+    real area = (face.weight[0] + face.weight[1]) + face.weight[2], x[3], y[3], of[3];
+    for (int v = 0; v < 3; v++) x[v] = face.vertex[v][VX], y[v] = face.vertex[v][VY];
+    shares(x, y, face.weight, &of[1], &of[2]);
+    of[0] = (1 - of[1]) - of[2];
+    Pulled q = pull_crossing(face.vertex[0], face.vertex[1], face.vertex[2],
+                             face.positive ? area : -area, bar->start[i], 0);
+    real sx = ray->x_high + ray->x_rest, sy = ray->y_high + ray->y_rest;
+    real in_space[3] = {q.x, q.y, ray->sign * q.z - sx * q.x - sy * q.y};
+    for (int k = 0; k < 3; k++) {
+      lanes->row[RBAR + k][i] -= in_space[k];
+      for (int v = 0; vertices && v < 3; v++) {
+        int point = mesh->cells[4 * (int64_t)cell + entry_corner(corner, v)];
+        vertices[4 * (int64_t)point + ray->axis[k]] += of[v] * in_space[k];
+      }
+    }
+    lanes->row[RBAR + 3][i] -= ray->sign * q.x * face.z;
+    lanes->row[RBAR + 4][i] -= ray->sign * q.y * face.z;
   }
 }
 

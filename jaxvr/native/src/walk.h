@@ -62,6 +62,7 @@ static int enter(const World *world, Block *block, int lane) {
   }
   lanes->row[DEPTH][lane] = face.z;
   lanes->row[DEPTH + 1][lane] = face.z_low;
+  lanes->row[LEAD][lane] = 0;
   lanes->row[BACK][lane] = face.value;
   lanes->integer[NEXT][lane] = word & ~8;
   lanes->integer[POSITIVE][lane] = face.positive;
@@ -81,6 +82,7 @@ static void fill_block(const World *world, Block *block, int64_t first, int coun
   }
   Lanes *lanes = &block->lanes;
   int n = 0;
+  lanes->leads = lanes->cuts = 0;
   for (int i = 0; i < count; i++) {
     lanes->integer[SLOT][n] = i;
     if (!enter(world, block, n)) continue;
@@ -143,6 +145,56 @@ static void exits_on_edge(Lanes *lanes, int n) {
   }
 }
 
+/* How far behind the depth reached an exit may lie by rounding: see trace/local.py, make_segment. */
+#define ROUNDING (16 * (real)REAL_EPS)
+
+/* From where the lanes have come to up to their exits. leads: whether any LEAD is not 0; returns
+ * whether any is now. */
+INLINE word_t segments(Lanes *lanes, int n, const int leads) {
+  real(*row)[LANES] = lanes->row;
+  int32_t(*integer)[LANES] = lanes->integer;
+  word_t any = 0;
+  LANES_LOOP
+  for (int i = 0; i < n; i++) {
+    int drop = integer[DROP][i], turned = (integer[WORD][i] >> 2) & 1;
+    int from_b = drop == 0, to_b = drop == 2;
+    real az = from_b ? row[B + VZ][i] : row[A + VZ][i];
+    real al = from_b ? row[B + VLOW][i] : row[A + VLOW][i];
+    real av = from_b ? row[B + VVALUE][i] : row[A + VVALUE][i];
+    real bz = to_b ? row[B + VZ][i] : row[C + VZ][i];
+    real bl = to_b ? row[B + VLOW][i] : row[C + VLOW][i];
+    real bv = to_b ? row[B + VVALUE][i] : row[C + VVALUE][i];
+    real z, z_low, value, d0 = row[DEPTH][i], d1 = row[DEPTH + 1][i];
+    crossing(az, al, av, bz, bl, bv, row[APEX + VZ][i], row[APEX + VLOW][i],
+             row[APEX + VVALUE][i], row[OF_B][i], row[OF_C][i], &z, &z_low, &value);
+    real advance = (z - d0) + (z_low - d1), chord = turned ? -advance : advance;
+    int proper = chord > 0, near = chord > -ROUNDING;
+    real e0 = proper ? z : d0, e1 = proper ? z_low : d1;
+    real entry = row[BACK][i], front = entry, back = value;
+    if (leads) {
+      real lead = row[LEAD][i], whole = lead + advance;
+      int cut = proper & (lead != 0), same = integer[REACHED][i];
+      real share = least(most(lead / (whole == 0 ? 1 : whole), 0), 1);
+      front = cut ? front + (value - front) * share : front;
+      row[CUT][i] = lead;
+      integer[CUT_AT][i] = same;
+      integer[REACHED][i] = lead == 0 ? integer[WORD][i] : same;
+    }
+    real left = near ? 0 : -advance;
+    any |= MASK(left != 0);
+    real length = clip_at_eye(d0 + d1, e0 + e1, proper ? chord : 0, &front, &back);
+    row[DEPTH][i] = e0;
+    row[DEPTH + 1][i] = e1;
+    row[LEAD][i] = left;
+    row[FRONT][i] = front;
+    row[BACK][i] = back;
+    row[LENGTH][i] = integer[LOST][i] ? 0 : length * row[STRETCH][i];
+    integer[FRESH][i] |= front != entry;
+  }
+  for (int i = 0; any && !leads && i < n; i++) integer[REACHED][i] = integer[WORD][i];
+  return any;
+}
+
 /* The fourth vertex of each lane's new cell, the exit, and the segment. */
 static void arrive(const Mesh *mesh, Lanes *lanes, int n) {
   real(*row)[LANES] = lanes->row;
@@ -201,31 +253,9 @@ static void arrive(const Mesh *mesh, Lanes *lanes, int n) {
     on_edge |= MASK(sum == 0);
   }
   if (on_edge) exits_on_edge(lanes, n);
-  LANES_LOOP
-  for (int i = 0; i < n; i++) {
-    int drop = integer[DROP][i], turned = (integer[WORD][i] >> 2) & 1;
-    int from_b = drop == 0, to_b = drop == 2;
-    real az = from_b ? row[B + VZ][i] : row[A + VZ][i];
-    real al = from_b ? row[B + VLOW][i] : row[A + VLOW][i];
-    real av = from_b ? row[B + VVALUE][i] : row[A + VVALUE][i];
-    real bz = to_b ? row[B + VZ][i] : row[C + VZ][i];
-    real bl = to_b ? row[B + VLOW][i] : row[C + VLOW][i];
-    real bv = to_b ? row[B + VVALUE][i] : row[C + VVALUE][i];
-    real z, z_low, value, d0 = row[DEPTH][i], d1 = row[DEPTH + 1][i];
-    crossing(az, al, av, bz, bl, bv, row[APEX + VZ][i], row[APEX + VLOW][i],
-             row[APEX + VVALUE][i], row[OF_B][i], row[OF_C][i], &z, &z_low, &value);
-    real advance = (z - d0) + (z_low - d1), chord = turned ? -advance : advance;
-    int proper = chord > 0;
-    real e0 = proper ? z : d0, e1 = proper ? z_low : d1;
-    real entry = row[BACK][i], front = entry, back = value;
-    real length = clip_at_eye(d0 + d1, e0 + e1, proper ? chord : 0, &front, &back);
-    row[DEPTH][i] = e0;
-    row[DEPTH + 1][i] = e1;
-    row[FRONT][i] = front;
-    row[BACK][i] = back;
-    row[LENGTH][i] = integer[LOST][i] ? 0 : length * row[STRETCH][i];
-    integer[FRESH][i] |= front != entry;
-  }
+  word_t behind = lanes->leads ? segments(lanes, n, 1) : segments(lanes, n, 0);
+  lanes->cuts = lanes->leads;
+  lanes->leads = behind != 0;
 }
 
 /* Through the exit face into the neighbour: names and selections. */

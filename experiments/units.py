@@ -1,0 +1,187 @@
+"""Over which units pictures keep their bits.
+
+    python -m experiments.units [--size 48] [--json FILE] [--tiny]
+
+Pictures are rendered with scalars (values and positions of control points), lengths (points, eye,
+target, extent) and with them extinctions (one over a length) times powers of two, up and down one
+power at a time, and compared with the picture in the units given: all bits, in both precisions, by
+compiled loops and JAX's own, from a pinhole and with parallel rays, by `render` and by `shade`. The
+gradients of a weighted sum by values, points, positions, colours, extinctions and eye are compared
+too, each times its own power of two. Told is the range of exponents without a gap where all bits
+are the same, and what the first picture outside of it is: an error in words, or a picture that is
+wrong. What `jaxvr.units` states is to be found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxvr
+from experiments.common import table
+
+# Beyond the exponents of subnormal and of the largest numbers.
+REACH = {"float32": 152, "float64": 1078}
+# Powers of the scalar's and of the length's unit in each number.
+POWERS = {
+    "values": (1, 0),
+    "points": (0, 1),
+    "positions": (1, 0),
+    "colors": (0, 0),
+    "extinctions": (0, -1),
+    "eye": (0, 1),
+    "target": (0, 1),
+}
+
+
+class Picture:
+    """A jittered box across two jumps, in any units."""
+
+    def __init__(self, dtype: str, size: int, parallel: bool = False, native: bool = True):
+        rng = np.random.default_rng(0)
+        self.dtype, self.size, self.parallel = dtype, size, parallel
+        self.adjoint = jaxvr.Replay(native=native)
+        self.mesh = jaxvr.datasets.box(
+            (4, 3, 3),
+            jitter=0.2,
+            seed=1,
+            dtype=dtype,
+            field=lambda p: p[:, 0] + 0.4 * np.sin(3 * p[:, 1]) - 0.3 * p[:, 2],
+        )
+        numbers = {
+            "values": self.mesh.values,
+            "points": self.mesh.points,
+            "positions": [-0.1, 0.1, 0.4, 0.4, 0.9, 0.9],
+            "colors": rng.uniform(0, 1, (6, 3)),
+            "extinctions": rng.uniform(0.3, 6, 6),
+            "eye": [1.9, 1.4, 2.3],
+            "target": [0.5, 0.5, 0.5],
+        }
+        self.numbers = {k: np.asarray(x, dtype) for k, x in numbers.items()}
+        self.extent = np.asarray(1.6, dtype)
+        self.weights = rng.normal(size=(size, size, 4)).astype(dtype)
+        self.slopes = jax.jit(
+            jax.grad(lambda n, extent: (self.image(n, extent) * self.weights).sum())
+        )
+
+    def parts(self, numbers: dict[str, Any], extent: Any):
+        n = {k: jnp.asarray(x) for k, x in numbers.items()}
+        view = {"width": self.size, "height": self.size, "dtype": self.dtype}
+        if self.parallel:
+            up = (0.0, 1.0, 0.0)
+            camera = jaxvr.Camera.orthographic(n["eye"], n["target"], up, extent, **view)
+        else:
+            camera = jaxvr.Camera.look_at(n["eye"], n["target"], **view)
+        transfer = jaxvr.TransferFunction(n["positions"], n["colors"], n["extinctions"])
+        return self.mesh.replace(values=n["values"], points=n["points"]), camera, transfer
+
+    def image(self, numbers: dict[str, Any], extent: Any) -> Any:
+        return jaxvr.render(*self.parts(numbers, extent), adjoint=self.adjoint)
+
+    def scaled(self, scalar: int, length: int) -> tuple[dict[str, np.ndarray], Any]:
+        numbers = {
+            k: np.ldexp(x, POWERS[k][0] * scalar + POWERS[k][1] * length)
+            for k, x in self.numbers.items()
+        }
+        return numbers, np.ldexp(self.extent, length)
+
+    def render(self, scalar: int, length: int) -> list[np.ndarray]:
+        return [np.asarray(self.image(*self.scaled(scalar, length)))]
+
+    def shade(self, scalar: int, length: int) -> list[np.ndarray]:
+        mesh, camera, transfer = self.parts(*self.scaled(scalar, length))
+        segments = jaxvr.trace(mesh, camera, native=self.adjoint.native)
+        return [np.asarray(jaxvr.shade(segments, transfer, adjoint=self.adjoint))]
+
+    def gradient(self, scalar: int, length: int) -> list[np.ndarray]:
+        self.image(*self.scaled(scalar, length))  # tells what is out of range
+        slopes = self.slopes(*self.scaled(scalar, length))
+        return [
+            np.ldexp(np.asarray(x), POWERS[k][0] * scalar + POWERS[k][1] * length)
+            for k, x in slopes.items()
+        ]
+
+
+def attempt(make: Any, want: list[np.ndarray], scalar: int, length: int) -> str:
+    """What became of it: the same bits, the error's name, or how far off the picture is."""
+    try:
+        got = make(scalar, length)
+    except (jaxvr.RenderError, ValueError) as error:
+        return type(error).__name__
+    if all(np.array_equal(a, b) for a, b in zip(got, want, strict=True)):
+        return "same bits"
+    off = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(got, want, strict=True))
+    return f"off by {off:.1g}"
+
+
+def span(make: Any, unit: str, reach: int, step: int) -> dict[str, Any]:
+    """The exponents, from 0 outwards, where all bits are the same, and what comes beyond."""
+    want = make(0, 0)
+    row: dict[str, Any] = {}
+    for side, sign in (("from", -1), ("to", 1)):
+        row[side], outside = 0, []
+        for k in range(step, reach, step):
+            both = (sign * k, 0) if unit == "scalar" else (0, sign * k)
+            found = attempt(make, want, *both)
+            if found == "same bits" and not outside:
+                row[side] = sign * k
+            elif not outside or outside[-1] != found:
+                outside.append(found)
+        row[f"beyond {side}"] = ", ".join(outside) or "-"
+    return row
+
+
+def run(
+    size: int = 48, steps: dict[str, int] | None = None, parallel: bool = True
+) -> dict[str, Any]:
+    """steps: of the exponents tried, by dtype."""
+    rows = []
+    for dtype in ("float32", "float64"):
+        step = (steps or {"float32": 1, "float64": 1})[dtype]
+        settings = [(False, True), (False, False), *([(True, True)] if parallel else [])]
+        for rays, native in settings:
+            picture = Picture(dtype, size, rays, native)
+            what = {"render": picture.render}
+            if native and not rays:
+                what |= {"shade(trace)": picture.shade, "gradients": picture.gradient}
+            for name, make in what.items():
+                for unit in ("scalar", "length"):
+                    row = {
+                        "dtype": dtype,
+                        "what": name,
+                        "loops": "compiled" if native else "JAX",
+                        "rays": "parallel" if rays else "pinhole",
+                        "unit": unit,
+                    }
+                    rows.append(row | span(make, unit, REACH[dtype], step))
+    print(table(rows), flush=True)
+    return {"size": size, "rows": rows}
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--size", type=int, default=48)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--tiny", action="store_true")
+    args = parser.parse_args(arguments)
+    jax.config.update("jax_enable_x64", True)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", jaxvr.ViewWarning)
+        if args.tiny:
+            report = run(6, {"float32": 33, "float64": 319}, parallel=False)
+        else:
+            report = run(args.size)
+    if args.json:
+        args.json.write_text(json.dumps(report, indent=1) + "\n")
+    return report
+
+
+if __name__ == "__main__":
+    main()

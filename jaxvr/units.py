@@ -1,0 +1,76 @@
+"""The units that pictures are computed in: those of no user, so that they depend on none.
+
+Three units are the user's: of length (points, eye, extent, and one over it in extinctions), of the
+scalar (values and positions of control points), and none of colours. A picture is the same in any
+of them; floats are not, since squares, reciprocals and differences of numbers near the ends of
+their range under- and overflow. So verbs compute with points that are near 1, and with control
+points that are: both are multiplied by powers of two, which is exact, and so are derivatives.
+
+What is left is a range for the numbers themselves. With B = 100 in float32 and 960 in float64
+
+    2^-B <= largest coordinate of the points <= 2^B        (8e-31 to 1e30; 1e-289 to 1e289)
+    2^-B <= largest of the scalars and positions           (up to the largest float)
+
+or all of them are 0. Below, some of the numbers are subnormal, which XLA takes for 0; above, some
+of the extinctions, which are one over a length, are. Then the status of every ray says so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxvr._core.status import LENGTHS, SCALARS
+from jaxvr._core.units import exponent_of, is_large, is_none, is_small, power_of_two
+from jaxvr.optics import TransferFunction
+
+Array = jax.Array
+
+
+class Units(NamedTuple):
+    """length, scalar (): what the user's numbers are multiplied with, powers of two. status ():
+    bits for all rays."""
+
+    length: Array
+    scalar: Array
+    status: Array
+
+
+def units_of(lengths: Array, scalars: Array, positions: Array | None = None, parts=0) -> Units:
+    """Those for coordinates, scalars and control points of any shape; or for lengths of segments,
+    which may be parts of 2^-parts of what the user's range is told of."""
+    dtype = lengths.dtype
+    size, field = exponent_of(lengths), exponent_of(scalars)
+    points = field if positions is None else exponent_of(positions)
+    most = jnp.maximum(points, field)
+    bits = jnp.where(is_small(size + parts, dtype) | is_large(size, dtype), LENGTHS, 0)
+    bits = bits | jnp.where(is_small(most, dtype), SCALARS, 0)
+    # Control points near 1, unless scalars overflow then.
+    room = int(jnp.finfo(dtype).maxexp) - 2
+    scale = jnp.where(is_none(points), -field, jnp.minimum(-points, room - field))
+    return Units(
+        power_of_two(jnp.where(is_none(size), 0, -size), dtype),
+        power_of_two(jnp.where(is_none(most), 0, scale), dtype),
+        bits.astype(jnp.int32),
+    )
+
+
+def mesh_in(units: Units, volume: Any) -> Any:
+    """A mesh in such units."""
+    return dataclasses.replace(
+        volume, points=volume.points * units.length, values=volume.values * units.scalar
+    )
+
+
+def transfer_in(units: Units, transfer: TransferFunction) -> TransferFunction:
+    """A transfer function in such units. An extinction that overflows there hides all behind it
+    within no length at all, and stays finite."""
+    most = jnp.asarray(jnp.finfo(transfer.extinctions.dtype).max / 8, transfer.extinctions.dtype)
+    return dataclasses.replace(
+        transfer,
+        positions=transfer.positions * units.scalar,
+        extinctions=jnp.minimum(transfer.extinctions / units.length, most),
+    )
