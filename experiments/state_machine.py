@@ -30,12 +30,15 @@ import jaxvr
 from tests import machine, orders
 
 
-def explore(minutes: float, seed: int, steps: int = 25) -> tuple[dict[str, int], list[str]]:
-    """Runs rounds of at most `steps` steps. Returns how many steps of each kind, and the faults."""
+def explore(
+    minutes: float, seed: int, steps: int = 10, small: bool = False
+) -> tuple[dict[str, int], list[str]]:
+    """Runs rounds of three examples of at most `steps` steps, over the recipes of the tests if
+    `small`. Returns how many steps of each kind, and the faults."""
     worker, count, faults = machine.Worker(), {}, []
     end = time.monotonic() + 60 * minutes
     settings = hypothesis.settings(
-        max_examples=4,  # the first that hypothesis makes is the simplest there is
+        max_examples=3,  # the first that hypothesis makes is the simplest there is
         stateful_step_count=steps,
         deadline=None,
         database=None,
@@ -45,7 +48,7 @@ def explore(minutes: float, seed: int, steps: int = 25) -> tuple[dict[str, int],
     )
     try:
         while time.monotonic() < end:
-            one = hypothesis.seed(seed)(machine.make_machine(worker, False, count))
+            one = hypothesis.seed(seed)(machine.make_machine(worker, small, count))
             try:
                 run_state_machine_as_test(one, settings=settings)
             except Exception:
@@ -84,6 +87,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--minutes", type=float, default=10)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=10, help="at most, in each example")
+    parser.add_argument("--small", action="store_true", help="the tests' recipes only")
     parser.add_argument("--orders", type=int, metavar="N", help="sequences of six, after all pairs")
     parser.add_argument("--run", action="store_true", help="compile and compare the numbers")
     parser.add_argument("--engine", choices=["compiled", "jax"], action="append")
@@ -95,7 +100,7 @@ def main(arguments: list[str] | None = None) -> None:
         engines = [False if e == "jax" else None for e in options.engine or ["compiled", "jax"]]
         dtypes = options.dtype or ["float32", "float64"]
         sys.exit(bool(all_orders(options.orders, options.run, engines, dtypes)))
-    count, faults = explore(options.minutes, options.seed)
+    count, faults = explore(options.minutes, options.seed, options.steps, options.small)
     print(f"{sum(count.values())} steps: {dict(sorted(count.items()))}")
     print(f"{len(faults)} faults")
     sys.exit(bool(faults))
