@@ -140,7 +140,8 @@ def span(make: Any, unit: str, reach: int, step: int) -> dict[str, Any]:
                 outside.append(found)
             if outside and k - abs(row[side]) == step:
                 for between in range(k - step + 1, k):
-                    if at(between) != "same bits":
+                    if (found := at(between)) != "same bits":
+                        outside = [found, *(x for x in outside if x != found)]
                         break
                     row[side] = sign * between
         row[f"beyond {side}"] = ", ".join(outside) or "-"
