@@ -3,13 +3,13 @@
     python -m experiments.units [--size 48] [--json FILE] [--tiny]
 
 Pictures are rendered with scalars (values and positions of control points), lengths (points, eye,
-target, extent) and with them extinctions (one over a length) times powers of two, up and down one
-power at a time, and compared with the picture in the units given: all bits, in both precisions, by
-compiled loops and JAX's own, from a pinhole and with parallel rays, by `render` and by `shade`. The
-gradients of a weighted sum by values, points, positions, colours, extinctions and eye are compared
-too, each times its own power of two. Told is the range of exponents without a gap where all bits
-are the same, and what the first picture outside of it is: an error in words, or a picture that is
-wrong. What `jaxvr.units` states is to be found.
+target, extent) and with them extinctions (one over a length) times powers of two, up and down, and
+compared with the picture in the units given: all bits, in both precisions, by compiled loops and
+JAX's own, from a pinhole and with parallel rays, by `render` and by `shade`. The gradients of a
+weighted sum by values, points, positions, colours, extinctions, eye and target are compared too,
+each times its own power of two. Told is the range of exponents without a gap where all bits are the
+same, and what pictures outside of it are: an error in words, or a picture that is wrong. What
+`jaxvr.units` states is to be found.
 """
 
 from __future__ import annotations
@@ -122,18 +122,28 @@ def attempt(make: Any, want: list[np.ndarray], scalar: int, length: int) -> str:
 
 
 def span(make: Any, unit: str, reach: int, step: int) -> dict[str, Any]:
-    """The exponents, from 0 outwards, where all bits are the same, and what comes beyond."""
+    """The exponents, from 0 outwards, where all bits are the same, and what comes beyond. Tried are
+    multiples of `step`, and every one between the last with the same bits and the first without."""
     want = make(0, 0)
     row: dict[str, Any] = {}
     for side, sign in (("from", -1), ("to", 1)):
         row[side], outside = 0, []
+
+        def at(k, sign=sign):
+            return attempt(make, want, *((sign * k, 0) if unit == "scalar" else (0, sign * k)))
+
         for k in range(step, reach, step):
-            both = (sign * k, 0) if unit == "scalar" else (0, sign * k)
-            found = attempt(make, want, *both)
+            found = at(k)
             if found == "same bits" and not outside:
                 row[side] = sign * k
             elif not outside or outside[-1] != found:
                 outside.append(found)
+            if outside and k - abs(row[side]) == step:
+                for between in range(k - step + 1, k):
+                    if (found := at(between)) != "same bits":
+                        outside = [found, *(x for x in outside if x != found)]
+                        break
+                    row[side] = sign * between
         row[f"beyond {side}"] = ", ".join(outside) or "-"
     return row
 
@@ -141,10 +151,10 @@ def span(make: Any, unit: str, reach: int, step: int) -> dict[str, Any]:
 def run(
     size: int = 48, steps: dict[str, int] | None = None, parallel: bool = True
 ) -> dict[str, Any]:
-    """steps: of the exponents tried, by dtype."""
+    """steps: see `span`, by dtype."""
     rows = []
     for dtype in ("float32", "float64"):
-        step = (steps or {"float32": 1, "float64": 1})[dtype]
+        step = (steps or {"float32": 8, "float64": 32})[dtype]
         settings = [(False, True), (False, False), *([(True, True)] if parallel else [])]
         for rays, native in settings:
             picture = Picture(dtype, size, rays, native)
@@ -161,6 +171,7 @@ def run(
                         "unit": unit,
                     }
                     rows.append(row | span(make, unit, REACH[dtype], step))
+                    print(rows[-1], flush=True)
     print(table(rows), flush=True)
     return {"size": size, "rows": rows}
 
