@@ -168,7 +168,7 @@ INLINE word_t segments(Lanes *lanes, int n, const int leads) {
     crossing(az, al, av, bz, bl, bv, row[APEX + VZ][i], row[APEX + VLOW][i],
              row[APEX + VVALUE][i], row[OF_B][i], row[OF_C][i], &z, &z_low, &value);
     real advance = (z - d0) + (z_low - d1), chord = turned ? -advance : advance;
-    int proper = chord > 0, near = chord > -ROUNDING;
+    int proper = chord > 0;
     real e0 = proper ? z : d0, e1 = proper ? z_low : d1;
     real entry = row[BACK][i], front = entry, back = value;
     if (leads) {
@@ -180,8 +180,9 @@ INLINE word_t segments(Lanes *lanes, int n, const int leads) {
       integer[CUT_AT][i] = same;
       integer[REACHED][i] = lead == 0 ? integer[WORD][i] : same;
     }
-    real left = near ? 0 : -advance;
-    any |= MASK(left != 0);
+    word_t late = MASK(chord <= -ROUNDING);
+    real left = PICK(late, -advance, 0);
+    any |= late;
     real length = clip_at_eye(d0 + d1, e0 + e1, proper ? chord : 0, &front, &back);
     row[DEPTH][i] = e0;
     row[DEPTH + 1][i] = e1;
