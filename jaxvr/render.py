@@ -282,7 +282,10 @@ def _render_rays(pipeline, adjoint, size, volume, origins, directions, transfer,
 def _shade(pipeline, adjoint, size, segments, transfer, background):
     segments = lax.optimization_barrier(segments)  # as above
     scene = pipeline.tracer.prepare(segments)
+    # A batch is filled up with runs that are empty: a copy would add to the last run's gradient.
     rays, count = batches(size, (segments.start[:-1], segments.start[1:]))
+    number = np.arange(rays[0].size).reshape(rays[0].shape)
+    rays = (rays[0], jnp.where(number < count, rays[1], rays[0]))
     rays = pipeline.tracer.prepare_rays(scene, *rays)
     rgba = _finish(pipeline, adjoint, scene, rays, transfer, scene.scalar.dtype, count)[0]
     rgba = jnp.zeros_like(rgba).at[segments.order].set(rgba, unique_indices=True)
@@ -301,10 +304,11 @@ def _count(tracer, native, size, volume, origins, directions):
 @partial(jax.jit, static_argnums=(0, 1, 2, 7))
 def _fill(tracer, native, size, volume, origins, directions, start, total):
     scene = tracer.prepare(volume)
-    (origins, directions, start), _ = batches(size, (origins, directions, start))
+    (origins, directions, starts), _ = batches(size, (origins, directions, start))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
-    fill_all = compiled.kernels.fill_nodes if native else partial(fill, tracer)
-    return fill_all(scene, rays, start, total)
+    if native:
+        return compiled.kernels.fill_nodes(scene, rays, start, total)
+    return fill(tracer, scene, rays, starts, total)
 
 
 def _run(pipeline, adjoint, size, volume, origins, directions, transfer):

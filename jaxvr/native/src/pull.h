@@ -190,19 +190,34 @@ static void pull_cells(Lanes *lanes, int n, CellBar *bar) {
   }
 }
 
+/* Sums over a group of blocks, and which chunks of CHUNK numbers have been added to. */
+#define CHUNK 64
+typedef struct {
+  real *sum;
+  char *touched;
+  int64_t size; /* of sum */
+} Part;
+
 /* To where they came from. vertices (P, 4): coordinates, and scalars at points; values: others. */
 static void scatter_cells(const Mesh *mesh, const Lanes *lanes, int n, const CellBar *bar,
-                          real *vertices, real *values) {
+                          Part *vertices, Part *values) {
   for (int i = 0; i < n; i++) {
     if (lanes->integer[LOST][i]) continue;
     int word = lanes->integer[WORD][i], cell = word >> 4, corner = word & 3;
     for (int v = 0; v < 4; v++) {
       int at = v < 3 ? entry_corner(corner, v) : corner;
-      real *point = vertices + 4 * (int64_t)mesh->cells[4 * (int64_t)cell + at];
+      int id = point_at(mesh, cell, at);
+      real *point = vertices->sum + 4 * (int64_t)id;
+      vertices->touched[id / (CHUNK / 4)] = 1;
       for (int k = 0; k < 3; k++) point[lanes->integer[AXES + k][i]] += bar->of[v][k][i];
       real of_value = bar->of[v][3][i];
-      if (mesh->location == AT_POINTS) point[3] += of_value;
-      else values[mesh->location == AT_CELLS ? cell : 4 * (int64_t)cell + at] += of_value;
+      if (mesh->location == AT_POINTS) {
+        point[3] += of_value;
+        continue;
+      }
+      int64_t slot = mesh->location == AT_CELLS ? cell : 4 * (int64_t)cell + at;
+      values->sum[slot] += of_value;
+      values->touched[slot / CHUNK] = 1;
     }
   }
 }
