@@ -314,7 +314,7 @@ def _say(message: str) -> None:
 
 
 def listen() -> None:
-    """Whether Ctrl-C ends the compiled loops: if it is a KeyboardInterrupt of Python, and not what a
+    """Whether Ctrl-C ends the compiled loops: if it is a KeyboardInterrupt, and not what a
     handler of the program's own makes of it, which may want to finish."""
     yes = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     for library in list(_loaded.values()):
