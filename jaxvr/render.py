@@ -302,7 +302,10 @@ def _shade(pipeline, adjoint, size, segments, transfer, background):
     )
     transfer = transfer_in(units, transfer)
     scene = pipeline.tracer.prepare(segments)
+    # A batch is filled up with runs that are empty: a copy would add to the last run's gradient.
     rays, count = batches(size, (segments.start[:-1], segments.start[1:]))
+    number = np.arange(rays[0].size).reshape(rays[0].shape)
+    rays = (rays[0], jnp.where(number < count, rays[1], rays[0]))
     rays = pipeline.tracer.prepare_rays(scene, *rays)
     rgba = _finish(pipeline, adjoint, scene, rays, transfer, scene.scalar.dtype, count)[0]
     rgba = jnp.zeros_like(rgba).at[segments.order].set(rgba, unique_indices=True)
@@ -326,10 +329,12 @@ def _fill(tracer, native, size, volume, origins, directions, start, total):
     units = units_of(volume.points, volume.values)
     volume, origins = mesh_in(units, volume), origins * units.length
     scene = tracer.prepare(volume)
-    (origins, directions, start), _ = batches(size, (origins, directions, start))
+    (origins, directions, starts), _ = batches(size, (origins, directions, start))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
-    fill_all = compiled.kernels.fill_nodes if native else partial(fill, tracer)
-    nodes = fill_all(scene, rays, start, total)
+    if native:
+        nodes = compiled.kernels.fill_nodes(scene, rays, start, total)
+    else:
+        nodes = fill(tracer, scene, rays, starts, total)
     return Nodes(nodes.scalar / units.scalar, nodes.length / units.length)
 
 

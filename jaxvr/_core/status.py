@@ -14,6 +14,7 @@ import numpy as np
 LOST = 1
 STEPS = 2
 K_TOO_SMALL = 4
+BROKEN = 8
 LENGTHS = 64
 SCALARS = 128
 
@@ -43,6 +44,11 @@ _MEANING = {  # what explains others first
         "needed a k-buffer with more entries",
         "Increase `k` of `KBuffer` (`jaxvr.measure_k` tells how many the view needs), or take the "
         "image as it is with `render(..., status=True)`.",
+    ),
+    BROKEN: (
+        "met integers that are out of range or do not fit together",
+        "Integers of a mesh are names of points, cells and faces, and not to be computed with: "
+        "average, step or scale its `points` and `values` only, with `mesh.replace`.",
     ),
 }
 

@@ -48,6 +48,7 @@ FLAGS = (
     *("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
 )
 TARGETS = ("render", "render_pull", "shade", "shade_pull", "count", "fill")
+EXPORTS = tuple(f"jaxvr_{name}" for name in (*TARGETS, "listen"))
 TIMEOUT = 300.0  # seconds for the compiler; it takes 7 on an idle core
 AGAIN = 60.0  # seconds after which what may have passed is tried again
 # What a failure depends on, beside the compiler and the folder.
@@ -207,8 +208,7 @@ def _try(made: Path) -> None:
         return
     run = [sys.executable, "-I", "-S", "-c", _TRIAL, str(made)]
     done = subprocess.run(
-        [*run, *(f"jaxvr_{n}" for n in TARGETS)],
-        **{"stdin": subprocess.DEVNULL, "capture_output": True, "timeout": TIMEOUT},
+        [*run, *EXPORTS], stdin=subprocess.DEVNULL, capture_output=True, timeout=TIMEOUT
     )
     if done.returncode:
         last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
@@ -221,6 +221,7 @@ def load(dtype: str) -> str | None:
     if os.environ.get("JAXVR_NATIVE", "1") == "0":
         return "The environment has JAXVR_NATIVE=0."
     if dtype in _loaded:
+        listen()
         return None
     with _lock:
         if dtype in _loaded:
@@ -232,6 +233,7 @@ def load(dtype: str) -> str | None:
         try:
             _loaded[dtype] = _register(dtype)
             _failed.pop(dtype, None)
+            listen()
             return None
         except NativeError as error:
             until = time.monotonic() + AGAIN if error.passing else float("inf")
@@ -273,8 +275,8 @@ def _open(file: Path) -> Any:
     """A library with all that it must have; else None, and the file is gone."""
     try:
         library = ctypes.CDLL(str(file))
-        for name in TARGETS:
-            getattr(library, f"jaxvr_{name}")
+        for name in EXPORTS:
+            getattr(library, name)
         return library
     except (OSError, AttributeError):
         cache.remove(file)
@@ -309,6 +311,14 @@ def _say(message: str) -> None:
             return
         _said.add(kind)
     warnings.warn(message, RuntimeWarning, stacklevel=3)
+
+
+def listen() -> None:
+    """Whether Ctrl-C ends the compiled loops: if it is a KeyboardInterrupt, and not what a
+    handler of the program's own makes of it, which may want to finish."""
+    yes = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    for library in list(_loaded.values()):
+        library.jaxvr_listen(int(yes))
 
 
 def target_name(name: str, dtype: str) -> str:

@@ -146,7 +146,7 @@ def scratch(folder: Path) -> Iterator[Path]:
 
 
 def _is_left_over(path: Path) -> bool:
-    """Old, and a build's: by its name, or what is in it (earlier versions: tmp and 8 letters)."""
+    """Old, and a build's: by its name, or by what is in it (once these were tmp and 8 letters)."""
     status = path.lstat()
     if not stat.S_ISDIR(status.st_mode) or time.time() - status.st_mtime < LEFT_OVER:
         return False

@@ -110,10 +110,11 @@ def count_nodes(scene: CastScene, rays: ShearedRays) -> tuple[Array, Array]:
 
 
 def fill_nodes(scene: CastScene, rays: ShearedRays, start: Array, total: int) -> Recording:
-    """The nodes (total,) of all rays, from `start` (N,) on: `trace.recorded.fill`."""
+    """The nodes (total,) of the first R rays, from `start` (R,) on: `trace.recorded.fill`. Others
+    are copies that fill a batch: they would write where the last ray does, at the same time."""
     dtype = scene.mesh.coordinates.dtype
     shapes = [Shape((total,), dtype)] * 2
-    return Recording(*_call("fill", dtype, shapes)(*_world(scene, rays)[0], start.reshape(-1)))
+    return Recording(*_call("fill", dtype, shapes)(*_world(scene, rays)[0], start))
 
 
 def _call(name: str, dtype: Any, shapes: Any):

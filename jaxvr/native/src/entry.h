@@ -79,7 +79,8 @@ static void search_packet(const Mesh *mesh, const Tree *tree, int count, const R
       continue;
     }
     int32_t word = any ? tree->faces[node - tree->leaves] : -1;
-    if (word >= 0) {
+    if (word >> 4 >= mesh->count) is_broken(mesh->watch);
+    else if (word >= 0) {
       int cell = word >> 4, corner = word & 3, inwards = (word >> 3) & 1;
       for (int i = 0; i < count; i++) {
         if (!meets[i]) continue;

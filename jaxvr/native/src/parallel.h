@@ -34,11 +34,14 @@ static inline int asks_metadata(XLA_FFI_CallFrame *frame) {
   return 1;
 }
 
-static inline Failure no_memory(XLA_FFI_CallFrame *frame) {
-  XLA_FFI_Error_Create_Args args = {XLA_FFI_Error_Create_Args_STRUCT_SIZE, NULL,
-                                    "jaxvr: no memory left for a block of rays",
-                                    XLA_FFI_Error_Code_RESOURCE_EXHAUSTED};
+static inline Failure fail(XLA_FFI_CallFrame *frame, XLA_FFI_Error_Code code, const char *why) {
+  XLA_FFI_Error_Create_Args args = {XLA_FFI_Error_Create_Args_STRUCT_SIZE, NULL, why, code};
   return frame->api->XLA_FFI_Error_Create(&args);
+}
+
+static inline Failure no_memory(XLA_FFI_CallFrame *frame) {
+  return fail(frame, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED,
+              "jaxvr: no memory left for a block of rays");
 }
 
 /* Pieces of work 0 to count - 1, taken by whoever is free. XLA's threads may come late or never:

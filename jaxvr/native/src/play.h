@@ -4,11 +4,14 @@
 #define JAXVR_PLAY_H
 
 #include "lanes.h"
+#include "watch.h"
 
-/* scalar, length: nodes; first, end (rays): the run of each ray. */
+/* scalar, length (count): nodes; first, end (rays): the run of each ray. */
 typedef struct {
   const real *scalar, *length;
   const int32_t *first, *end;
+  int64_t count;
+  Watch *watch;
 } Nodes;
 
 /* Lanes for rays first to first + count - 1; rows from SUMS on are zero. */
@@ -16,7 +19,11 @@ static int fill_runs(const Nodes *nodes, Lanes *lanes, int64_t first, int count,
   int n = 0;
   for (int i = 0; i < count; i++) {
     int64_t r = first + i;
-    if (nodes->end[r] - nodes->first[r] < 2) continue;
+    if ((int64_t)nodes->end[r] - nodes->first[r] < 2) continue;
+    if (nodes->first[r] < 0 || nodes->end[r] > nodes->count) {
+      is_broken(nodes->watch);
+      continue;
+    }
     for (int k = SUMS; k < rows; k++) lanes->row[k][n] = 0;
     lanes->row[BACK][n] = nodes->scalar[nodes->first[r]];
     lanes->integer[RAY][n] = (int32_t)r;

@@ -213,13 +213,21 @@ INLINE void pull_cells_by(Lanes *lanes, int n, CellBar *bar, const int cuts) {
   }
 }
 
+/* Sums over a group of blocks, and which chunks of CHUNK numbers have been added to. */
+#define CHUNK 64
+typedef struct {
+  real *sum;
+  char *touched;
+  int64_t size; /* of sum */
+} Part;
+
 static void pull_cells(Lanes *lanes, int n, CellBar *bar) {
   if (lanes->cuts) pull_cells_by(lanes, n, bar, 1);
   else pull_cells_by(lanes, n, bar, 0);
 }
 
 /* Takes the cotangents of depths where segments were cut off to the faces that those are of. */
-static void pull_starts(const Mesh *mesh, Block *block, const CellBar *bar, real *vertices) {
+static void pull_starts(const Mesh *mesh, Block *block, const CellBar *bar, Part *vertices) {
   Lanes *lanes = &block->lanes;
   for (int i = 0; lanes->cuts && i < block->n; i++) {
     if (lanes->row[CUT][i] == 0 || bar->start[i] == 0 || lanes->integer[LOST][i]) continue;
@@ -237,9 +245,10 @@ static void pull_starts(const Mesh *mesh, Block *block, const CellBar *bar, real
     real in_space[3] = {q.x, q.y, ray->sign * q.z - sx * q.x - sy * q.y};
     for (int k = 0; k < 3; k++) {
       lanes->row[RBAR + k][i] -= in_space[k];
-      for (int v = 0; vertices && v < 3; v++) {
-        int point = mesh->cells[4 * (int64_t)cell + entry_corner(corner, v)];
-        vertices[4 * (int64_t)point + ray->axis[k]] += of[v] * in_space[k];
+      for (int v = 0; vertices->sum && v < 3; v++) {
+        int point = point_at(mesh, cell, entry_corner(corner, v));
+        vertices->sum[4 * (int64_t)point + ray->axis[k]] += of[v] * in_space[k];
+        vertices->touched[point / (CHUNK / 4)] = 1;
       }
     }
     lanes->row[RBAR + 3][i] -= ray->sign * q.x * face.z;
@@ -249,17 +258,24 @@ static void pull_starts(const Mesh *mesh, Block *block, const CellBar *bar, real
 
 /* To where they came from. vertices (P, 4): coordinates, and scalars at points; values: others. */
 static void scatter_cells(const Mesh *mesh, const Lanes *lanes, int n, const CellBar *bar,
-                          real *vertices, real *values) {
+                          Part *vertices, Part *values) {
   for (int i = 0; i < n; i++) {
     if (lanes->integer[LOST][i]) continue;
     int word = lanes->integer[WORD][i], cell = word >> 4, corner = word & 3;
     for (int v = 0; v < 4; v++) {
       int at = v < 3 ? entry_corner(corner, v) : corner;
-      real *point = vertices + 4 * (int64_t)mesh->cells[4 * (int64_t)cell + at];
+      int id = point_at(mesh, cell, at);
+      real *point = vertices->sum + 4 * (int64_t)id;
+      vertices->touched[id / (CHUNK / 4)] = 1;
       for (int k = 0; k < 3; k++) point[lanes->integer[AXES + k][i]] += bar->of[v][k][i];
       real of_value = bar->of[v][3][i];
-      if (mesh->location == AT_POINTS) point[3] += of_value;
-      else values[mesh->location == AT_CELLS ? cell : 4 * (int64_t)cell + at] += of_value;
+      if (mesh->location == AT_POINTS) {
+        point[3] += of_value;
+        continue;
+      }
+      int64_t slot = mesh->location == AT_CELLS ? cell : 4 * (int64_t)cell + at;
+      values->sum[slot] += of_value;
+      values->touched[slot / CHUNK] = 1;
     }
   }
 }

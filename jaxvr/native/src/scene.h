@@ -3,14 +3,17 @@
 #define JAXVR_SCENE_H
 
 #include "lanes.h"
+#include "watch.h"
 
 enum { AT_POINTS, AT_CELLS, AT_CORNERS };
 
-/* vertices (P, 4): coordinates and, for values at points, the scalar. */
+/* vertices (P, 4): coordinates and, for values at points, the scalar. points, count: P and T. */
 typedef struct {
   const real *vertices, *values;
   const int32_t *cells, *neighbors;
   int location, seams;
+  int64_t points, count;
+  Watch *watch;
 } Mesh;
 
 /* One ray, as the walk sees it: trace/shear.py. S_x = high + rest, low_head: head of its lost part. */
@@ -91,9 +94,14 @@ INLINE void crossing(real az, real al, real av, real bz, real bl, real bv, real 
   *value = av + (of_b * (bv - av) + of_c * (cv - av));
 }
 
+/* The id of a cell's corner. */
+static inline int32_t point_at(const Mesh *mesh, int cell, int corner) {
+  return within(mesh->watch, mesh->cells[4 * (int64_t)cell + corner], mesh->points);
+}
+
 /* A vertex of a face as a single ray sees it: five numbers. */
 static inline void see(const Mesh *mesh, const Ray *ray, int cell, int corner, real out[VERTEX]) {
-  int point = mesh->cells[4 * (int64_t)cell + corner];
+  int point = point_at(mesh, cell, corner);
   const real *p = mesh->vertices + 4 * (int64_t)point;
   shear(p[ray->axis[0]], p[ray->axis[1]], p[ray->axis[2]], ray->origin[0], ray->origin[1],
         ray->origin[2], ray->x_high, ray->x_rest, ray->x_low, ray->y_high, ray->y_rest, ray->y_low,

@@ -203,7 +203,8 @@ static int go_on(const Transfer *tf, Lanes *lanes, Pieces *p, int m, int dense, 
   for (int j = 0; any && j < m; j++) {
     if (!p->onward[j]) continue;
     int i = dense ? j : p->lane[j];
-    go_to_slab(tf, lanes, i, lanes->integer[SLAB][i] + p->onward[j], table);
+    int to = lanes->integer[SLAB][i] + p->onward[j];
+    go_to_slab(tf, lanes, i, to < 0 ? 0 : to > tf->count ? tf->count : to, table);
     p->lane[left++] = i;
   }
   return left;

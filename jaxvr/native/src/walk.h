@@ -6,7 +6,9 @@
 
 #include "entry.h"
 
+/* As in _core/status.py. */
 #define STATUS_LOST 1
+#define STATUS_BROKEN 8
 
 /* axes (3, N); numbers (9, N): origin, S_x, S_y, their lost parts, sign, stretch. */
 typedef struct {
@@ -23,6 +25,7 @@ typedef struct {
 
 typedef struct {
   int n;
+  int64_t steps; /* that its rays have made, together */
   Ray rays[LANES];
   Entries entries[LANES];
   Lanes lanes;
@@ -74,6 +77,7 @@ static int enter(const World *world, Block *block, int lane) {
 static void fill_block(const World *world, Block *block, int64_t first, int count, int rows) {
   real before[PACKET];
   int32_t none[PACKET];
+  block->steps = 0;
   for (int i = 0; i < PACKET; i++) before[i] = -INFINITY, none[i] = -1;
   for (int i = 0; i < count; i++) load_ray(&world->rays, first + i, block->rays + i);
   for (int i = 0; i < count; i += PACKET) {
@@ -110,7 +114,7 @@ static void reload_values(const Mesh *mesh, Lanes *lanes, int n) {
     real x[3], y[3], w[3], s[3], of_b, of_c;
     for (int v = 0; v < 3; v++) {
       int k = entry_corner(corner, v);
-      s[v] = value_at(mesh, cell, k, mesh->cells[4 * (int64_t)cell + k]);
+      s[v] = value_at(mesh, cell, k, point_at(mesh, cell, k));
       lanes->row[FACE + v * VERTEX + VVALUE][i] = s[v];
       x[v] = lanes->row[FACE + v * VERTEX + VX][i], y[v] = lanes->row[FACE + v * VERTEX + VY][i];
       w[v] = lanes->row[WEIGHT + v][i];
@@ -205,12 +209,17 @@ static void arrive(const Mesh *mesh, Lanes *lanes, int n) {
   if (mesh->location != AT_POINTS || mesh->seams) reload_values(mesh, lanes, n);
   /* One kind of access at a time, so that as many as possible wait for memory together; and what
    * `leave` will want, while there is other work. */
+  uint32_t points = (uint32_t)mesh->points;
+  int broken = 0;
   LANES_LOOP
   for (int i = 0; i < n; i++) {
     int word = integer[NEXT][i];
-    integer[POINT][i] = cells[4 * (word >> 4) + (word & 3)];
+    int point = cells[4 * (word >> 4) + (word & 3)], astray = (uint32_t)point >= points;
+    integer[POINT][i] = astray ? 0 : point;
     integer[WORD][i] = word;
+    broken |= astray;
   }
+  if (broken) is_broken(mesh->watch);
   for (int i = 0; i < n; i++) __builtin_prefetch(vertices + 4 * (int64_t)integer[POINT][i]);
   for (int i = 0; i < n; i++)
     __builtin_prefetch(mesh->neighbors + 4 * (int64_t)(integer[WORD][i] >> 4));
@@ -287,20 +296,31 @@ static void leave(const Mesh *mesh, Lanes *lanes, int n) {
   }
 }
 
+/* Whether a block has rays to be moved, and is not to end early: see watch.h. */
+static inline int goes_on(const World *world, Block *block) {
+  Watch *watch = world->mesh.watch;
+  if (block->n && ++block->steps > world->mesh.count) is_broken(watch);
+  return block->n && !is_over(watch);
+}
+
 /* Lanes that left the mesh enter again, or are handed to `done` and make room; so do those whose
  * optical depth has reached `enough`. */
 static void settle(const World *world, Block *block, int rows, real enough,
                    void (*done)(void *, Lanes *, int), void *data) {
   Lanes *lanes = &block->lanes;
+  uint32_t cells = (uint32_t)world->mesh.count;
   word_t any = 0;
   LANES_LOOP
   for (int i = 0; i < block->n; i++) {
-    word_t out = MASK(lanes->integer[NEXT][i] < 0);
+    /* A cell that is not there, and the outside: both are no cell. */
+    word_t out = MASK((uint32_t)(lanes->integer[NEXT][i] >> 4) >= cells);
     any |= out | MASK(lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough);
   }
   for (int i = block->n - 1; any && i >= 0; i--) {
     int ended = lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough;
-    if (lanes->integer[NEXT][i] >= 0 && !ended) continue;
+    int next = lanes->integer[NEXT][i] >> 4;
+    if ((uint32_t)next < cells && !ended) continue;
+    if (next != -1) is_broken(world->mesh.watch);
     if (!ended && !lanes->integer[LOST][i] && enter(world, block, i)) continue;
     done(data, lanes, i);
     move_lane(lanes, rows, --block->n, i);
