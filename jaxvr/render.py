@@ -23,7 +23,7 @@ from jax import lax
 from jaxvr import hints
 from jaxvr import native as compiled
 from jaxvr._core.checks import is_concrete
-from jaxvr._core.status import LOST, check
+from jaxvr._core.status import BROKEN, LOST, check
 from jaxvr.adjoint import AbstractAdjoint, Pipeline
 from jaxvr.adjoint.base import Operands
 from jaxvr.adjoint.replay import settle
@@ -317,7 +317,20 @@ def _run(pipeline, adjoint, size, volume, origins, directions, transfer):
     rays, count = batches(size, (origins, directions))
     rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(*rays)
     rgba, status = _finish(pipeline, adjoint, scene, rays, transfer, origins.dtype, count)
-    return rgba, jnp.where(are_rays(origins.T, directions.T), status, status | LOST)
+    status = jnp.where(are_rays(origins.T, directions.T), status, status | LOST)
+    return rgba, jnp.where(_in_range(volume, getattr(adjoint, "native", False)), status, BROKEN)
+
+
+def _in_range(volume: Any, compiled_loops: Any) -> Array:
+    """Whether integers () of a mesh name points and cells that it has. Compiled loops look at those
+    of cells themselves, as they load them."""
+    count = volume.cells.shape[0]
+    good = jnp.all((volume.boundary >= 0) & (volume.boundary >> 4 < count))
+    if compiled_loops:
+        return good
+    cells, words = volume.cells, volume.neighbors
+    good = good & jnp.all((cells >= 0) & (cells < volume.points.shape[0]))
+    return good & jnp.all((words >= -1) & (words >> 4 < count))
 
 
 def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):
