@@ -25,7 +25,7 @@ from jaxvr import hints
 from jaxvr import native as compiled
 from jaxvr._core.checks import is_concrete
 from jaxvr._core.modes import custom_vjp_refused
-from jaxvr._core.status import LOST, check
+from jaxvr._core.status import BROKEN, LOST, check
 from jaxvr.adjoint import AbstractAdjoint, Pipeline
 from jaxvr.adjoint.base import Operands
 from jaxvr.adjoint.replay import FORWARD_MODE, settle
@@ -348,7 +348,20 @@ def _run(pipeline, adjoint, size, volume, origins, directions, transfer):
     rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(*rays)
     rgba, status = _finish(pipeline, adjoint, scene, rays, transfer, origins.dtype, count)
     status = jnp.where(are_rays(origins.T, directions.T), status, status | LOST)
-    return rgba, status | units.status
+    good = _in_range(volume, getattr(adjoint, "native", False))
+    return rgba, jnp.where(good, status, BROKEN) | units.status
+
+
+def _in_range(volume: Any, compiled_loops: Any) -> Array:
+    """Whether integers () of a mesh name points and cells that it has. Compiled loops look at those
+    of cells themselves, as they load them."""
+    count = volume.cells.shape[0]
+    good = jnp.all((volume.boundary >= 0) & (volume.boundary >> 4 < count))
+    if compiled_loops:
+        return good
+    cells, words = volume.cells, volume.neighbors
+    good = good & jnp.all((cells >= 0) & (cells < volume.points.shape[0]))
+    return good & jnp.all((words >= -1) & (words >> 4 < count))
 
 
 def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):
