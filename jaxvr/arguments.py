@@ -23,6 +23,7 @@ from jaxvr.composite import Over
 from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
 from jaxvr.trace import AbstractTracer, RayCast, Segments
 from jaxvr.view.camera import Camera
+from jaxvr.volume.integrity import require_mesh
 from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
@@ -50,6 +51,7 @@ def _cast(tree: Any, dtype: Any) -> Any:
 
 def volume_of(volume: Any) -> TetMesh:
     require_kind("volume", volume, TetMesh, "Read files with jaxvr.read_mesh.")
+    require_mesh(volume)
     return volume
 
 
@@ -64,6 +66,8 @@ def camera_of(camera: Any, volume: Any) -> Camera:
 
 def transfer_of(transfer: Any, volume: Any) -> TransferFunction:
     require_kind("transfer", transfer, TransferFunction)
+    # Its numbers may have been computed with since it was made: the same checks once more.
+    transfer = TransferFunction(transfer.positions, transfer.colors, transfer.extinctions)
     return _cast(transfer, dtype_of(volume))
 
 

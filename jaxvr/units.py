@@ -22,8 +22,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
-from jaxvr._core.status import LENGTHS, SCALARS
+from jaxvr._core.status import LENGTHS, SCALARS, UNSORTED
 from jaxvr._core.units import exponent_of, is_large, is_none, is_small, power_of_two
 from jaxvr.optics import TransferFunction
 
@@ -48,6 +49,8 @@ def units_of(lengths: Array, scalars: Array, positions: Array | None = None, par
     most = jnp.maximum(points, field)
     bits = jnp.where(is_small(size + parts, dtype) | is_large(size, dtype), LENGTHS, 0)
     bits = bits | jnp.where(is_small(most, dtype), SCALARS, 0)
+    if positions is not None:
+        bits = bits | jnp.where(_is_ascending(positions), 0, UNSORTED)
     # Control points near 1, unless scalars overflow then.
     room = int(jnp.finfo(dtype).maxexp) - 2
     scale = jnp.where(is_none(points), -field, jnp.minimum(-points, room - field))
@@ -56,6 +59,17 @@ def units_of(lengths: Array, scalars: Array, positions: Array | None = None, par
         power_of_two(jnp.where(is_none(most), 0, scale), dtype),
         bits.astype(jnp.int32),
     )
+
+
+def _is_ascending(positions: Array) -> Array:
+    held = lax.stop_gradient(positions)
+    return jnp.all(held[1:] >= held[:-1]) & jnp.all(jnp.isfinite(held))
+
+
+def _ascending(positions: Array) -> Array:
+    """Positions (K,) that ascend and are finite, made of any."""
+    held = lax.stop_gradient(positions)
+    return lax.cummax(jnp.where(jnp.isfinite(held), held, 0))
 
 
 def mesh_in(units: Units, volume: Any) -> Any:
@@ -69,8 +83,12 @@ def transfer_in(units: Units, transfer: TransferFunction) -> TransferFunction:
     """A transfer function in such units. An extinction that overflows there hides all behind it
     within no length at all, and stays finite."""
     most = jnp.asarray(jnp.finfo(transfer.extinctions.dtype).max / 8, transfer.extinctions.dtype)
+    # Pieces of a segment go from one position to the next, which would not end among these.
+    positions = jnp.where(
+        _is_ascending(transfer.positions), transfer.positions, _ascending(transfer.positions)
+    )
     return dataclasses.replace(
         transfer,
-        positions=transfer.positions * units.scalar,
+        positions=positions * units.scalar,
         extinctions=jnp.minimum(transfer.extinctions / units.length, most),
     )

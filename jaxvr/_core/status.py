@@ -15,6 +15,7 @@ LOST = 1
 STEPS = 2
 K_TOO_SMALL = 4
 BROKEN = 8
+UNSORTED = 16
 LENGTHS = 64
 SCALARS = 128
 
@@ -30,6 +31,11 @@ _MEANING = {  # what explains others first
         "The largest of the field and the control points has to be at least 2^-100 = 7.9e-31 in "
         "float32, 2^-960 = 1e-289 in float64. Take another unit, for `values` and for the "
         "transfer function's `positions`, or float64.",
+    ),
+    UNSORTED: (
+        "The transfer function's positions are not in ascending order, or not finite.",
+        "They were when it was made: keep them so in what changes them, for instance by summing up "
+        "positive steps.",
     ),
     LOST: (
         "found no way out of a cell",
@@ -68,7 +74,7 @@ def check(status: Any) -> None:
         return
     for bit, (what, advice) in _MEANING.items():
         hit = (bits & bit) != 0
-        if hit.any() and bit in (LENGTHS, SCALARS):  # of the whole picture
+        if hit.any() and bit in (LENGTHS, SCALARS, UNSORTED):  # of the whole picture
             raise RenderError(f"{what} {advice}")
         if hit.any():
             first = tuple(int(i) for i in np.argwhere(hit)[0])

@@ -56,8 +56,8 @@ def _user() -> str:
 
 
 def prepare(folder: Path) -> Path:
-    """A folder that only this user (or root) can write to: this one, made with mode 0700 or brought
-    to it; else, as in /tmp, one for this user in it.
+    """A folder that only this user (or root) can write to: this one, made with mode 0700 or, if it
+    is jaxvr's by its name, brought to it; else, as in /tmp, one for this user in it.
 
     Raises:
       OSError: if there is none.
@@ -70,8 +70,9 @@ def prepare(folder: Path) -> Path:
     status = folder.stat()
     if is_ours(status):
         return folder
+    # A folder with another name has other uses too, which are not ours to forbid.
     mine = hasattr(os, "getuid") and status.st_uid == os.getuid()
-    if mine and not status.st_mode & stat.S_ISVTX:
+    if mine and folder.name == "jaxvr":
         folder.chmod(0o700)
         return folder
     own = folder / f"jaxvr-{_user()}"

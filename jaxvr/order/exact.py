@@ -37,6 +37,7 @@ from jaxvr.order.keys import AbstractOrder
 from jaxvr.view import Camera
 from jaxvr.volume import TetMesh, packing
 from jaxvr.volume.connectivity import FACES, orientations
+from jaxvr.volume.integrity import require_mesh
 
 _CELLS = 1 << 18  # at once, where sides are found
 _BOUND = 16 * 2.0**-53  # orient3d (see `volume.geometry`) and the rounding of a direction of view
@@ -83,6 +84,7 @@ def exact_order(mesh: TetMesh, camera: Camera) -> ExactOrder:
         )
     if not is_concrete(*jax.tree.leaves((mesh, camera))):
         raise ValueError("exact_order needs to know the numbers: call it outside of jit and grad.")
+    require_mesh(mesh)
     cells, words = np.asarray(mesh.cells), np.asarray(mesh.neighbors)
     view = look(mesh, camera)
     tau = orientations(words, np.asarray(mesh.boundary))[0]

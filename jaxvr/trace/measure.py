@@ -32,6 +32,7 @@ from jaxvr.trace.select import Sort
 from jaxvr.trace.stream import beam_rays, draw, tolerance
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size, batches, tile, untile
+from jaxvr.volume.integrity import require_mesh
 from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
@@ -97,6 +98,7 @@ def measure_k(
         raise ValueError(
             f'direction must be "front to back" or "back to front", but is {direction!r}.'
         )
+    require_mesh(volume)
     require_lengths("volume.points", volume.points)
     camera = jax.tree.map(lambda x: jnp.asarray(x).astype(volume.dtype), camera)
     rays, count = batches(batch_size(volume.dtype), tuple(tile(x) for x in camera.rays()))

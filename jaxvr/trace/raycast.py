@@ -118,8 +118,9 @@ class Ahead(NamedTuple):
 
 
 class CastState(NamedTuple):
-    """One state of R rays. Only `pull_back` and `locate` read `cell`: loops without them do not
-    carry it, since XLA drops what nothing depends on."""
+    """One state of R rays. left (R,): how many more cells each may be in. Only `pull_back` and
+    `locate` read `cell`: loops without them do not carry it, since XLA drops what nothing depends
+    on."""
 
     cell: Cell
     ahead: Ahead
@@ -130,6 +131,7 @@ class CastState(NamedTuple):
     status: Array
     entries: Entries
     last: tuple[Array, Array]
+    left: Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,6 +180,7 @@ class RayCast(AbstractTracer):
             status=integer,
             entries=no_entries(count, dtype, more=True),
             last=(zero - jnp.inf, integer - 1),
+            left=integer + scene.mesh.neighbors.shape[0] // 4,
         )
 
     def step(self, scene: CastScene, rays: ShearedRays, state: CastState, move: Array) -> CastState:
@@ -303,8 +306,10 @@ def _cross(
     reached = Reached(ahead.depth, ahead.lead)
     segment, reached = stage(wanted, make_segment, reached, front, out, turned, rays.stretch)
     lost = moved & leave.lost
+    # A ray is in a cell once: one that comes back follows words that belong to no mesh.
+    astray = moved & (state.left == 0)
     cell = Cell(word, ahead.positive, face, ahead.weights, exit_corner, ahead.lead, ahead.reached)
-    active = jnp.where(moved, ~lost, state.active)
+    active = jnp.where(moved, ~(lost | astray), state.active)
     segment = choose(moved, segment, state.segment)
     return CastState(
         cell=choose(moved, cell, state.cell),
@@ -322,9 +327,12 @@ def _cross(
         active=active,
         waiting=state.waiting,
         fresh=moved & (fresh | entered | (segment.front != front)),
-        status=state.status | jnp.where(lost, bits.LOST, 0).astype(jnp.int32),
+        status=state.status
+        | jnp.where(lost, bits.LOST, 0).astype(jnp.int32)
+        | jnp.where(astray, bits.BROKEN, 0).astype(jnp.int32),
         entries=state.entries,
         last=state.last,
+        left=state.left - moved,
     )
 
 

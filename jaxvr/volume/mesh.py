@@ -14,6 +14,7 @@ import numpy as np
 from .._core.checks import as_floats, is_concrete, require_finite, require_shape
 from .._core.pytree import pytree, static
 from .build import build
+from .integrity import trust
 from .mirror import mirrored
 from .report import MeshReport
 from .values import choose_location, place, rounded
@@ -233,13 +234,15 @@ def _from_cells(
     for message in (news.warning(), rounded("values", values, placed.dtype)):
         if message:
             warnings.warn(message, UserWarning, stacklevel=stacklevel)
-    return cls(
-        points=jnp.asarray(built.points),
-        values=jnp.asarray(placed),
-        cells=jnp.asarray(built.cells),
-        neighbors=jnp.asarray(built.neighbors),
-        boundary=jnp.asarray(built.boundary),
-        duplicates=jnp.asarray(built.duplicates),
-        location=where,
-        report=built.report,
+    return trust(
+        cls(
+            points=jnp.asarray(built.points),
+            values=jnp.asarray(placed),
+            cells=jnp.asarray(built.cells),
+            neighbors=jnp.asarray(built.neighbors),
+            boundary=jnp.asarray(built.boundary),
+            duplicates=jnp.asarray(built.duplicates),
+            location=where,
+            report=built.report,
+        )
     )

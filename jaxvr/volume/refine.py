@@ -36,6 +36,7 @@ import numpy as np
 from .._core.checks import is_concrete
 from .._core.units import scaled_to_one
 from .geometry import flat_cells, signed_volumes
+from .integrity import require_mesh
 from .mesh import TetMesh, _from_cells
 from .packing import cell_of, corner_of
 from .weld import weld
@@ -102,6 +103,7 @@ def _check(mesh: Any) -> None:
             "mesh is traced, but which cells to cut follows from its numbers. Use it outside jit "
             "and grad."
         )
+    require_mesh(mesh)
 
 
 def delaunay_deviation(mesh: TetMesh) -> np.ndarray:

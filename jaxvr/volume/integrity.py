@@ -1,0 +1,149 @@
+"""Whether the integers of a mesh are those of a mesh (NumPy, not traced).
+
+A mesh is a pytree, and pytrees are computed with: an average of two, a step of an optimiser over
+all leaves, a copy with one array put in by hand. Integers that come out of that name other cells
+and points than they should, or none, and a walk that follows them has no picture to give. So verbs
+look before they start, at each array once: those of a mesh that was built are known to be right.
+
+The checks are those of the invariants in `TetMesh`: kinds and shapes; points and values finite; the
+corners of a cell four different points in the order of their welded ids; the cell across a face
+names this one in return, and has the face's three points; and each face without a neighbour is in
+the boundary, once.
+"""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._core.checks import is_concrete, require_finite
+from . import packing
+from .connectivity import FACES
+
+_ADVICE = (
+    "Connectivity cannot be computed with: apply functions such as jax.tree.map to mesh.points and "
+    "mesh.values and use mesh.replace(...), or build the mesh anew."
+)
+
+# By ids of arrays, and of how many points they name some: what was found right.
+_known: dict[tuple[int, ...], tuple[weakref.ref, ...]] = {}
+
+
+def _is_known(arrays: tuple[Any, ...], n_points: int = 0) -> bool:
+    found = _known.get((n_points, *map(id, arrays)))
+    return found is not None and all(
+        ref() is array for ref, array in zip(found, arrays, strict=True)
+    )
+
+
+def _remember(arrays: tuple[Any, ...], n_points: int = 0) -> None:
+    key = (n_points, *map(id, arrays))
+
+    def forget(_: Any) -> None:
+        _known.pop(key, None)
+
+    # NumPy's arrays can be written to, so what was seen in them need not stay.
+    if all(isinstance(array, jax.Array) for array in arrays):
+        _known[key] = tuple(weakref.ref(array, forget) for array in arrays)
+
+
+def _connectivity(mesh: Any) -> tuple[Any, ...]:
+    return mesh.cells, mesh.neighbors, mesh.boundary, mesh.duplicates
+
+
+def trust(mesh: Any) -> Any:
+    """The mesh, whose arrays were just made by `build`."""
+    _remember(_connectivity(mesh), mesh.points.shape[0])
+    _remember((mesh.points,))
+    _remember((mesh.values,))
+    return mesh
+
+
+def require_mesh(mesh: Any) -> None:
+    """ValueError that names the array and the first entry that is wrong. Of numbers that are traced
+    only kinds and shapes are looked at."""
+    connectivity = _connectivity(mesh)
+    _require_kinds(mesh)
+    for name, x in (("points", mesh.points), ("values", mesh.values)):
+        if is_concrete(x) and not _is_known((x,)):
+            require_finite(f"mesh.{name}", x)
+            _remember((x,))
+    n_points = mesh.points.shape[0]
+    if is_concrete(*connectivity) and not _is_known(connectivity, n_points):
+        cells, neighbors, boundary, duplicates = map(np.asarray, connectivity)
+        _require_connectivity(cells, neighbors, boundary, duplicates, n_points)
+        _remember(connectivity, n_points)
+
+
+def _require_kinds(mesh: Any) -> None:
+    for name in ("cells", "neighbors", "boundary", "duplicates"):
+        x = getattr(mesh, name)
+        if np.dtype(x.dtype).kind != "i":
+            raise ValueError(f"mesh.{name} must hold integers, but has dtype {x.dtype}. {_ADVICE}")
+    count, points = mesh.cells.shape[0], mesh.points.shape[0]
+    values = {"point": (points,), "cell": (count,), "corner": (count, 4)}[mesh.location]
+    wanted = {
+        "points": (points, 3),
+        "values": values,
+        "cells": (count, 4),
+        "neighbors": (count, 4),
+        "boundary": mesh.boundary.shape[:1],
+        "duplicates": (*mesh.duplicates.shape[:1], 2),
+    }
+    for name, shape in wanted.items():
+        if getattr(mesh, name).shape != shape:
+            found = getattr(mesh, name).shape
+            raise ValueError(f"mesh.{name} must have shape {shape}, but has {found}. {_ADVICE}")
+
+
+def _require(good: np.ndarray, name: str, numbers: np.ndarray, what: str) -> None:
+    if not good.all():
+        first = tuple(int(i) for i in np.argwhere(~good)[0])
+        raise ValueError(
+            f"mesh.{name} is not that of a mesh: {int((~good).sum())} entries {what}, the first at "
+            f"{first}: {numbers[first]}. {_ADVICE}"
+        )
+
+
+def _require_connectivity(
+    cells: np.ndarray,
+    neighbors: np.ndarray,
+    boundary: np.ndarray,
+    duplicates: np.ndarray,
+    n_points: int,
+) -> None:
+    count = len(cells)
+    if count == 0:
+        raise ValueError("The mesh has no cells.")
+    named = f"name none of the {n_points} points"
+    _require((cells >= 0) & (cells < n_points), "cells", cells, named)
+    _require((duplicates >= 0) & (duplicates < n_points), "duplicates", duplicates, named)
+    welded = np.arange(n_points)
+    welded[duplicates[:, 0]] = duplicates[:, 1]
+    rows = welded[cells]
+    ordered = np.diff(rows, axis=1) > 0
+    _require(ordered, "cells", cells[:, 1:], "are not in the order of welded points")
+    inside = (neighbors >= 0) & (packing.cell_of(neighbors) < count)
+    none = f"name none of the {count} cells"
+    _require(inside | (neighbors == -1), "neighbors", neighbors, none)
+    there = np.maximum(packing.cell_of(neighbors), 0), packing.corner_of(neighbors)
+    back = neighbors[there]
+    here = np.arange(count)[:, None], np.arange(4)[None]
+    returned = (packing.cell_of(back) == here[0]) & (packing.corner_of(back) == here[1])
+    own = rows[:, FACES]
+    shared = (rows[there[0][..., None], FACES[there[1]]] == own).all(-1)
+    joined = (returned & shared) | (neighbors == -1)
+    _require(joined, "neighbors", neighbors, "name a cell that does not have the face")
+    known = (boundary >= 0) & (packing.cell_of(boundary) < count)
+    _require(known, "boundary", boundary, none)
+    outside = packing.cell_of(boundary), packing.corner_of(boundary)
+    _require(neighbors[outside] == -1, "boundary", boundary, "name a face with a neighbour")
+    open_faces = int((neighbors == -1).sum())
+    if len(np.unique(4 * outside[0].astype(np.int64) + outside[1])) != open_faces:
+        raise ValueError(
+            f"mesh.boundary is not that of a mesh: it does not have each of the {open_faces} faces "
+            f"without a neighbour. {_ADVICE}"
+        )

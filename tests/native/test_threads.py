@@ -1,0 +1,89 @@
+"""What threads and signals have no say in: last bits of gradients, and how soon Ctrl-C ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+GRADIENTS = """
+import os, sys
+os.sched_setaffinity(0, {int(c) for c in sys.argv[1].split(",")})
+import hashlib, jax, numpy as np, jaxvr
+jax.config.update("jax_enable_x64", True)
+for dtype in ("float32", "float64"):
+    mesh = jaxvr.datasets.box((4, 4, 4), field=lambda p: p[:, 0] + p[:, 1] * p[:, 2], dtype=dtype)
+    camera = jaxvr.Camera.orbit(mesh, azimuth=31, elevation=17, width=64, height=48)
+    transfer = jaxvr.TransferFunction([0, 0.4, 1.3], np.eye(3), [0.5, 2, 4], dtype=dtype)
+    def loss(values, points, transfer, camera):
+        image = jaxvr.render(mesh.replace(values=values, points=points), camera, transfer,
+                             adjoint=jaxvr.Replay(native=True))
+        return (image**2).sum()
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3)))
+    found = jax.tree.leaves(gradient(mesh.values, mesh.points, transfer, camera))
+    print(hashlib.sha256(b"".join(np.asarray(x).tobytes() for x in found)).hexdigest())
+"""
+
+
+def _some_cpus() -> list[int]:
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
+@pytest.mark.skipif(len(_some_cpus()) < 2, reason="needs two processors to compare with one")
+def test_gradients_do_not_depend_on_the_number_of_threads():
+    one, two = (",".join(map(str, _some_cpus()[:n])) for n in (1, 2))
+    digests = [
+        subprocess.run(
+            [sys.executable, "-c", GRADIENTS, cpus], cwd=ROOT, capture_output=True, text=True
+        )
+        for cpus in (one, two)
+    ]
+    assert digests[0].stdout.split() == digests[1].stdout.split(), digests[0].stderr
+    assert len(digests[0].stdout.split()) == 2, digests[0].stderr
+
+
+LONG = """
+import jax, numpy as np, jaxvr
+mesh = jaxvr.datasets.box((16, 16, 16), field=lambda p: p[:, 0])
+transfer = jaxvr.default_transfer(mesh).with_points(64)
+cameras = [jaxvr.Camera.orbit(mesh, width=w, height=w) for w in (16, 4096)]
+rays = [np.asarray(x).reshape(-1, 3)[:4000] for x in cameras[1].replace(width=64, height=64).rays()]
+small = [np.resize(x, (4_000_000, 3)) for x in rays]
+jax.block_until_ready(jaxvr.render_rays(mesh, *small, transfer, adjoint=jaxvr.Replay(native=True)))
+print("ready", flush=True)
+try:
+    for _ in range(100):
+        jax.block_until_ready(
+            jaxvr.render_rays(mesh, *small, transfer, adjoint=jaxvr.Replay(native=True))
+        )
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+    mesh = jaxvr.datasets.box((1, 1, 1), field=lambda p: p[:, 0])
+    print(bool(np.isfinite(jaxvr.render(mesh, cameras[0], transfer)).all()), flush=True)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_ctrl_c_ends_the_compiled_loops_and_leaves_them_usable():
+    process = subprocess.Popen(
+        [sys.executable, "-c", LONG], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    first = process.stdout.readline()
+    assert first == "ready\n", process.communicate()
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    sent = time.monotonic()
+    said = process.stdout.readline()
+    took = time.monotonic() - sent
+    rest, errors = process.communicate(timeout=60)
+    assert said == "interrupted\n" and rest == "True\n", said + rest + errors
+    assert took < 5, took  # a second where nothing else runs; a picture takes longer than this

@@ -1,0 +1,145 @@
+"""Meshes and transfer functions whose leaves were computed with: told, never followed into a crash,
+an endless loop or a wrong picture."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvr
+from jaxvr._core.status import BROKEN, UNSORTED
+
+MESH = jaxvr.datasets.box((2, 2, 1), field=lambda p: p[:, 0] + 0.2 * p[:, 1], dtype="float32")
+CAMERA = jaxvr.Camera.orbit(MESH, azimuth=31, elevation=17, width=4, height=3)
+TRANSFER = jaxvr.TransferFunction([0.0, 0.4, 1.3], np.eye(3), [0.5, 2.0, 4.0], dtype="float32")
+INTEGERS = ("cells", "neighbors", "boundary")
+ENGINES = {"compiled": jaxvr.Replay(), "jax": jaxvr.Replay(native=False)}
+
+pytestmark = pytest.mark.usefixtures("quick_code")
+
+
+def changed(**leaves):
+    return dataclasses.replace(MESH, **leaves)
+
+
+def mutants(count, seed):
+    """Meshes with one integer changed: bits flipped, out of range, or that of another entry."""
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        name = INTEGERS[rng.integers(3)]
+        x = np.array(getattr(MESH, name))
+        at = tuple(rng.integers(n) for n in x.shape)
+        other = tuple(rng.integers(n) for n in x.shape)
+        x[at] = rng.choice(
+            [x[at] ^ (1 << int(rng.integers(31))), -7, 2**31 - 1, -(2**31), x[other]]
+        )
+        yield name, changed(**{name: jnp.asarray(x)})
+
+
+VERBS = {
+    "render": lambda m: jaxvr.render(m, CAMERA, TRANSFER),
+    "rays": lambda m: jaxvr.render_rays(m, *CAMERA.rays(), TRANSFER),
+    "trace": lambda m: jaxvr.trace(m, CAMERA),
+    "probe": lambda m: jaxvr.probe(m, CAMERA, TRANSFER),
+    "measure_k": lambda m: jaxvr.measure_k(m, CAMERA),
+    "exact_order": lambda m: jaxvr.order.exact_order(m, CAMERA),
+    "refine": lambda m: jaxvr.refine(m),
+}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("name", INTEGERS)
+def test_an_average_over_all_leaves_names_the_integers(verb, name):
+    halves = changed(**{name: getattr(MESH, name) / 2})
+    with pytest.raises(ValueError, match=rf"mesh\.{name} must hold integers.*mesh\.replace"):
+        VERBS[verb](halves)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_integers_of_no_mesh_are_an_error(verb):
+    scaled = changed(neighbors=MESH.neighbors * 3)
+    with pytest.raises(ValueError, match=r"mesh\.neighbors is not that of a mesh"):
+        VERBS[verb](scaled)
+
+
+def test_numbers_that_are_not_finite_are_an_error():
+    for name in ("points", "values"):
+        broken = changed(**{name: getattr(MESH, name).at[3].set(jnp.nan)})
+        with pytest.raises(ValueError, match=rf"mesh\.{name}"):
+            jaxvr.render(broken, CAMERA, TRANSFER)
+
+
+def test_integers_of_another_mesh():
+    other = jaxvr.datasets.box((2, 1, 1), field=lambda p: p[:, 0], dtype="float32")
+    with pytest.raises(ValueError, match="must have shape"):
+        jaxvr.render(changed(points=other.points), CAMERA, TRANSFER)
+    with pytest.raises(ValueError, match="not that of a mesh"):
+        jaxvr.render(changed(boundary=MESH.boundary[:-1]), CAMERA, TRANSFER)
+
+
+def test_changed_integers_are_found():
+    """All but changes of the bits `turned`, `seam` and `entry`, which no other entry confirms, and
+    those that change nothing."""
+    found = 0
+    for name, mutant in mutants(200, seed=1):
+        old, new = (np.asarray(getattr(m, name)) for m in (MESH, mutant))
+        soft = 12 if name != "cells" else 0
+        if ((old ^ new) & ~soft == 0).all():
+            continue
+        with pytest.raises(ValueError, match=r"mesh\.\w+ is not that of a mesh"):
+            jaxvr.render(mutant, CAMERA, TRANSFER)
+        found += 1
+    assert found > 120
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_traced_integers_end_in_a_status(engine):
+    """Under a user's jit nothing can be raised: whatever the integers are, rays end, and where one
+    names nothing, all say so."""
+    draw = jax.jit(
+        lambda m: jaxvr.render(m, CAMERA, TRANSFER, adjoint=ENGINES[engine], status=True)
+    )
+    for name, mutant in mutants(100, seed=2):
+        x = np.asarray(getattr(mutant, name))
+        few = MESH.n_points if name == "cells" else MESH.n_tets
+        number = x if name == "cells" else x >> 4
+        least = -1 if name == "neighbors" else 0
+        nothing = ((number < least) | (number >= few) | ((x < -1) & (name == "neighbors"))).any()
+        bits = np.asarray(draw(mutant)[1])
+        # Compiled loops look at cells as they come to them.
+        if nothing and (engine == "jax" or name == "boundary"):
+            assert (bits & BROKEN).all(), (name, x[x != np.asarray(getattr(MESH, name))])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_rings_end(engine):
+    """Each cell's neighbour across any face is the cell itself: a walk that never leaves."""
+    cell = np.arange(MESH.n_tets)[:, None] << 4 | np.arange(4)[None]
+    ring = changed(neighbors=jnp.asarray(cell.astype(np.int32)))
+    draw = jax.jit(
+        lambda m: jaxvr.render(m, CAMERA, TRANSFER, adjoint=ENGINES[engine], status=True)
+    )
+    bits = np.asarray(draw(ring)[1])
+    assert (bits & BROKEN).any()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("positions", [[0.4, 0.0, 1.3], [0.0, np.nan, 1.3], [1.3, 0.4, -np.inf]])
+def test_positions_out_of_order(engine, positions):
+    leaves = (jnp.asarray(positions, jnp.float32), TRANSFER.colors, TRANSFER.extinctions)
+    moved = jax.tree.unflatten(jax.tree.structure(TRANSFER), leaves)
+    with pytest.raises(ValueError, match="positions"):
+        jaxvr.render(MESH, CAMERA, moved)
+    segments = jaxvr.trace(MESH, CAMERA)
+    with pytest.raises(ValueError, match="positions"):
+        jaxvr.shade(segments, moved)
+    draw = jax.jit(lambda t: jaxvr.render(MESH, CAMERA, t, adjoint=ENGINES[engine], status=True))
+    image, bits = draw(moved)
+    assert np.isfinite(image).all() and (np.asarray(bits) & UNSORTED).all()
+    with pytest.raises(jaxvr.RenderError, match="ascending order"):
+        jaxvr.check(bits)
+    assert not np.asarray(draw(TRANSFER)[1]).any()
