@@ -320,7 +320,7 @@ static void settle(const World *world, Block *block, int rows, real enough,
     int ended = lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough;
     int next = lanes->integer[NEXT][i] >> 4;
     if ((uint32_t)next < cells && !ended) continue;
-    if (next != -1) is_broken(world->mesh.watch);
+    if (next != -1 && (uint32_t)next >= cells) is_broken(world->mesh.watch);
     if (!ended && !lanes->integer[LOST][i] && enter(world, block, i)) continue;
     done(data, lanes, i);
     move_lane(lanes, rows, --block->n, i);
