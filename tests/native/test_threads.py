@@ -50,40 +50,45 @@ def test_gradients_do_not_depend_on_the_number_of_threads():
 
 
 LONG = """
-import jax, numpy as np, jaxvr
+import time, jax, numpy as np, jaxvr
 mesh = jaxvr.datasets.box((16, 16, 16), field=lambda p: p[:, 0])
 transfer = jaxvr.default_transfer(mesh).with_points(64)
-cameras = [jaxvr.Camera.orbit(mesh, width=w, height=w) for w in (16, 4096)]
-rays = [np.asarray(x).reshape(-1, 3)[:4000] for x in cameras[1].replace(width=64, height=64).rays()]
-small = [np.resize(x, (4_000_000, 3)) for x in rays]
-jax.block_until_ready(jaxvr.render_rays(mesh, *small, transfer, adjoint=jaxvr.Replay(native=True)))
-print("ready", flush=True)
+camera = jaxvr.Camera.orbit(mesh, width=64, height=64)
+rays = [np.resize(np.asarray(x).reshape(-1, 3), (2_000_000, 3)) for x in camera.rays()]
+
+def draw():
+    adjoint = jaxvr.Replay(native=True)
+    return jax.block_until_ready(jaxvr.render_rays(mesh, *rays, transfer, adjoint=adjoint))
+
+draw()
+start = time.monotonic()
+draw()
+print(time.monotonic() - start, flush=True)
 try:
-    for _ in range(100):
-        jax.block_until_ready(
-            jaxvr.render_rays(mesh, *small, transfer, adjoint=jaxvr.Replay(native=True))
-        )
+    draw()
 except KeyboardInterrupt:
     print("interrupted", flush=True)
-    mesh = jaxvr.datasets.box((1, 1, 1), field=lambda p: p[:, 0])
-    print(bool(np.isfinite(jaxvr.render(mesh, cameras[0], transfer)).all()), flush=True)
+    print(bool(np.isfinite(jaxvr.render(mesh, camera, transfer)).all()), flush=True)
 """
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_ctrl_c_ends_the_compiled_loops_and_leaves_them_usable():
+    """Half way through, it takes less than the half that is left: no timing but that of one run."""
     process = subprocess.Popen(
-        [sys.executable, "-c", LONG], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        [sys.executable, "-c", LONG],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-    )  # fmt: skip
+    )
     assert process.stdout is not None
-    first = process.stdout.readline()
-    assert first == "ready\n", process.communicate()
-    time.sleep(0.3)
+    whole = float(process.stdout.readline())
+    time.sleep(whole / 2)
     process.send_signal(signal.SIGINT)
     sent = time.monotonic()
     said = process.stdout.readline()
     took = time.monotonic() - sent
-    rest, errors = process.communicate(timeout=60)
+    rest, errors = process.communicate(timeout=120)
     assert said == "interrupted\n" and rest == "True\n", said + rest + errors
-    assert took < 5, took  # a second where nothing else runs; a picture takes longer than this
+    assert took < whole / 3, (took, whole)

@@ -4,6 +4,7 @@ an endless loop or a wrong picture."""
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,9 +35,8 @@ def mutants(count, seed):
         x = np.array(getattr(MESH, name))
         at = tuple(rng.integers(n) for n in x.shape)
         other = tuple(rng.integers(n) for n in x.shape)
-        x[at] = rng.choice(
-            [x[at] ^ (1 << int(rng.integers(31))), -7, 2**31 - 1, -(2**31), x[other]]
-        )
+        numbers: Any = [x[at] ^ (1 << int(rng.integers(31))), -7, 2**31 - 1, -(2**31), x[other]]
+        x[at] = rng.choice(numbers)
         yield name, changed(**{name: jnp.asarray(x)})
 
 
