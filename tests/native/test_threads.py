@@ -65,7 +65,8 @@ start = time.monotonic()
 draw()
 print(time.monotonic() - start, flush=True)
 try:
-    draw()
+    while True:
+        draw()
 except KeyboardInterrupt:
     print("interrupted", flush=True)
     print(bool(np.isfinite(jaxvr.render(mesh, camera, transfer)).all()), flush=True)
@@ -74,7 +75,8 @@ except KeyboardInterrupt:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_ctrl_c_ends_the_compiled_loops_and_leaves_them_usable():
-    """Half way through, it takes less than the half that is left: no timing but that of one run."""
+    """After a quarter of a picture, it takes much less than the three quarters that are left: rays
+    are prepared by XLA's own kernels first, which nothing ends."""
     process = subprocess.Popen(
         [sys.executable, "-c", LONG],
         cwd=ROOT,
@@ -84,11 +86,11 @@ def test_ctrl_c_ends_the_compiled_loops_and_leaves_them_usable():
     )
     assert process.stdout is not None
     whole = float(process.stdout.readline())
-    time.sleep(whole / 2)
+    time.sleep(whole / 4)
     process.send_signal(signal.SIGINT)
     sent = time.monotonic()
     said = process.stdout.readline()
     took = time.monotonic() - sent
     rest, errors = process.communicate(timeout=120)
     assert said == "interrupted\n" and rest == "True\n", said + rest + errors
-    assert took < whole / 3, (took, whole)
+    assert took < whole / 2, (took, whole)
