@@ -47,7 +47,8 @@ def units_of(lengths: Array, scalars: Array, positions: Array | None = None, par
     size, field = exponent_of(lengths), exponent_of(scalars)
     points = field if positions is None else exponent_of(positions)
     most = jnp.maximum(points, field)
-    bits = jnp.where(is_small(size + parts, dtype) | is_large(size, dtype), LENGTHS, 0)
+    least = jnp.where(is_none(size), size, size + parts)
+    bits = jnp.where(is_small(least, dtype) | is_large(size, dtype), LENGTHS, 0)
     bits = bits | jnp.where(is_small(most, dtype), SCALARS, 0)
     if positions is not None:
         bits = bits | jnp.where(_is_ascending(positions), 0, UNSORTED)

@@ -222,3 +222,11 @@ def test_powers_of_two():
             assert np.frexp(unit)[0] == 0.5 and 0.5 <= x * unit < 4
             assert float(power_of_two(jnp.int32(exponent), dtype)) > 0
         assert float(near_one(jnp.zeros(3, dtype))) == 1
+
+
+def test_segments_of_a_view_past_the_mesh_have_no_unit(dtype):
+    """All lengths are 0, which is no small length."""
+    mesh = jaxvr.datasets.box((1, 1, 1), field=lambda p: p[:, 0], dtype=dtype)
+    camera = jaxvr.Camera.look_at((0, 0, 9), (0, 0, 20), width=4, height=3, dtype=dtype)
+    image = jaxvr.shade(jaxvr.trace(mesh, camera), jaxvr.default_transfer(mesh))
+    assert not np.asarray(image).any()
