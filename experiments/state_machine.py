@@ -5,7 +5,7 @@
 
 Rounds of random steps over the public verbs, with other shapes, dtypes, engines and threads than
 the tests', each result compared with that of a process without a history (`tests/machine.py`). A
-fault is shrunk by hypothesis and printed as a program; then it goes on with the next seed. With
+fault is printed as hypothesis's program of steps; then it goes on with the next seed. With
 `--orders`, programs of six pullbacks, on both engines and in both precisions, are compared to the
 bit of what is computed, or with `--run` of what comes out (`tests/orders.py`).
 """
