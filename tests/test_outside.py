@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+import experiments.data
+
 TESTS = """
 import pytest
 
@@ -33,6 +35,9 @@ def session(tmp_path):
     clone = tmp_path / "folder" / "clone" / "tests"
     clone.mkdir(parents=True)
     shutil.copy(Path(__file__).with_name("outside.py"), clone)
+    (clone.parent / "experiments").mkdir()
+    for module in (experiments, experiments.data):
+        shutil.copy(module.__file__, clone.parent / "experiments")
     (clone / "conftest.py").write_text(
         "import outside\n"
         "def pytest_configure(config):\n"
@@ -44,6 +49,7 @@ def session(tmp_path):
         ours = ("CI", "JAXVR_DATA", "JAXVR_VECTORS")
         env = {k: v for k, v in os.environ.items() if k not in ours and "PYTEST" not in k}
         command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-q", *options]
+        command += ["-o", f"pythonpath={clone.parent}"]
         done = subprocess.run(
             command, cwd=clone, env=env | variables, capture_output=True, text=True, timeout=120
         )
@@ -94,3 +100,17 @@ def test_folder_that_lacks_a_file_fails_and_names_it(session):
     (session.beside / "vectors" / "v.npz").touch()
     code, told = session(CI="true")
     assert code == 0 and "5 passed" in told
+
+
+def test_experiments_know_the_same_folders(tmp_path):
+    """`none` is no folder of that name, wherever a script is started."""
+    (tmp_path / "can.vtu").touch()
+    found = experiments.data.path_of("can.vtu", {"JAXVR_DATA": str(tmp_path)})
+    assert found == tmp_path / "can.vtu"
+    for environment, words in (
+        ({"JAXVR_DATA": "none"}, "JAXVR_VECTORS is none"),
+        ({"JAXVR_DATA": str(tmp_path), "JAXVR_VECTORS": "none"}, "JAXVR_VECTORS is none"),
+        ({"JAXVR_DATA": "none", "JAXVR_VECTORS": str(tmp_path)}, f"v.npz is missing in {tmp_path}"),
+    ):
+        with pytest.raises(FileNotFoundError, match=words):
+            experiments.data.path_of("vectors/v.npz", environment)
