@@ -7,8 +7,9 @@ the checkout. `JAXVR_DATA=none` says that there are none, and speaks for both fo
 
 from __future__ import annotations
 
+import argparse
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared"
@@ -38,3 +39,11 @@ def path_of(name: str, environment: Mapping[str, str] = os.environ) -> Path:
     if not (place / rest).exists():
         raise FileNotFoundError(f"{name} is missing in {place}. Set {variable} to its folder.")
     return place / rest
+
+
+def meshes_of(names: Iterable[str], parser: argparse.ArgumentParser) -> dict[str, Path]:
+    """The files of meshes by name; where one is not at hand, the script ends and says so."""
+    try:
+        return {name: path_of(f"{name}.vtu") for name in names}
+    except FileNotFoundError as error:
+        parser.error(str(error))

@@ -1,8 +1,8 @@
 """Rendering against brute force on small meshes, the slab against its vectors, and brute force
 against what can be said in closed form.
 
-The meshes, rays and comparison are those of `experiments/exactness.py`, which runs them on all of
-the real data.
+The rays and the comparison are those of `experiments/exactness.py`, which runs them on all of the
+real data.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import jaxvr
 from experiments import exactness, lost_rays
 from jaxvr.testing.brute import BruteForce
 from jaxvr.volume import datasets
+from tests.stand_ins import named
 
 pytestmark = pytest.mark.usefixtures("loops")
 
@@ -74,11 +75,14 @@ def test_reference_counts_a_ray_in_shared_faces_once():
     np.testing.assert_allclose(found, 1.0, rtol=1e-14)
 
 
-@pytest.mark.outside("football_zoo.vtu")
+# Of the beam's rays more lie in faces and in the boundary, on lines that its cells share.
+FIELDS = {"beam.vtu": "sample_point_scalars"}
+
+
+@pytest.mark.parametrize("file", named("football_zoo.vtu", "beam.vtu"))
 @pytest.mark.parametrize("location", [None, "cell", "corner"])
-def test_zoo_cells(data_path, dtype, location):
-    data_path("football_zoo.vtu")
-    found = exactness.run_mesh("football_zoo", dtype, 800, location)
+def test_zoo_cells(file_of, file, dtype, location):
+    found = exactness.run_mesh(file_of(file), dtype, 800, location, FIELDS.get(file))
     assert found["status"] == 0
     assert found["worst"] <= WORST[dtype], found
     # only rays in the boundary or, for discontinuous data, in faces are left out
@@ -101,29 +105,27 @@ def test_lattice_seen_exactly_along_its_axes(dtype):
     assert found["worst"] <= WORST[dtype], found
 
 
-@pytest.mark.outside("football_zoo.vtu")
-def test_quadrature_is_an_independent_witness(data_path):
-    data_path("football_zoo.vtu")
-    mesh = exactness.read_mesh(data_path("football_zoo.vtu"), None, np.float64)
+@pytest.mark.parametrize("file", named("football_zoo.vtu", "beam.vtu"))
+def test_quadrature_is_an_independent_witness(file_of, file):
+    mesh = exactness.read_mesh(file_of(file), FIELDS.get(file), np.float64)
     reference = BruteForce(mesh)
     rays = exactness.make_rays(mesh, reference, "random", 100, np.random.default_rng(0))
     found = exactness.compare(mesh, {"random": rays}, integrator=jaxvr.Quadrature(samples=12))
     assert found["worst"] <= 1e-10, found
 
 
-@pytest.mark.outside("football_zoo.vtu")
-def test_lost_rays_on_a_small_mesh(data_path, dtype):
-    data_path("football_zoo.vtu")
-    found = lost_rays.run_mesh("football_zoo", dtype, 1000, 1, {})
+@pytest.mark.parametrize("file", named("football_zoo.vtu", "beam.vtu"))
+def test_lost_rays_on_a_small_mesh(file_of, file, dtype):
+    found = lost_rays.run_mesh(file_of(file), dtype, 1000, 1, {}, FIELDS.get(file))
     assert found["status"] == 0
     assert found["differ_clear"] == 0, found
 
 
-@pytest.mark.outside("vectors/segment_vectors_public.npz")
+@pytest.mark.parametrize("file", named("vectors/segment_vectors_public.npz", "vectors/slabs.npz"))
 @pytest.mark.parametrize(
     "dtype, value, slope", [("float64", 1e-15, 5e-15), ("float32", 5e-7, 7e-7)]
 )
-def test_slab_against_vectors(data_path, dtype, value, slope):
-    found = exactness.check_slab(data_path("vectors/segment_vectors_public.npz"), dtype)
+def test_slab_against_vectors(file_of, file, dtype, value, slope):
+    found = exactness.check_slab(file_of(file), dtype)
     assert found["rgb"] <= value and found["alpha"] <= value, found
     assert found["jacfwd"] <= slope and found["jacrev"] <= slope, found
