@@ -7,6 +7,7 @@ real data.
 
 from __future__ import annotations
 
+import itertools
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -75,14 +76,29 @@ def test_reference_counts_a_ray_in_shared_faces_once():
     np.testing.assert_allclose(found, 1.0, rtol=1e-14)
 
 
-# Of the beam's rays more lie in faces and in the boundary, on lines that its cells share.
+def crossed(file, cases):
+    """Parameters: a file with cases of others, of which the first says which loops run."""
+    (entry,) = named(file)
+    return [pytest.param(file, *case, marks=entry.marks) for case in cases]
+
+
 FIELDS = {"beam.vtu": "sample_point_scalars"}
+DTYPES, LOCATIONS = ("float32", "float64"), (None, "cell", "corner")
+ALL = list(itertools.product(("compiled", "jax"), DTYPES, LOCATIONS))
+# JAX's loops compile for ten seconds each time.
+SOME = [("compiled", "float32", None), ("compiled", "float32", "cell")]
+SOME += [("compiled", "float64", None), ("compiled", "float64", "corner")]
+SOME += [("jax", "float32", "corner"), ("jax", "float64", None)]
 
 
-@pytest.mark.parametrize("file", named("football_zoo.vtu", "beam.vtu"))
-@pytest.mark.parametrize("location", [None, "cell", "corner"])
-def test_zoo_cells(file_of, file, dtype, location):
-    found = exactness.run_mesh(file_of(file), dtype, 800, location, FIELDS.get(file))
+@pytest.mark.parametrize(
+    "file, loops, dtype, location",
+    crossed("football_zoo.vtu", ALL) + crossed("beam.vtu", SOME),
+    indirect=["loops"],
+)
+def test_zoo_cells(file_of, file, loops, dtype, location):
+    rays = 800 if file == "football_zoo.vtu" else 400
+    found = exactness.run_mesh(file_of(file), dtype, rays, location, FIELDS.get(file))
     assert found["status"] == 0
     assert found["worst"] <= WORST[dtype], found
     # only rays in the boundary or, for discontinuous data, in faces are left out
@@ -105,8 +121,12 @@ def test_lattice_seen_exactly_along_its_axes(dtype):
     assert found["worst"] <= WORST[dtype], found
 
 
-@pytest.mark.parametrize("file", named("football_zoo.vtu", "beam.vtu"))
-def test_quadrature_is_an_independent_witness(file_of, file):
+@pytest.mark.parametrize(
+    "file, loops",
+    crossed("football_zoo.vtu", [("compiled",), ("jax",)]) + crossed("beam.vtu", [("compiled",)]),
+    indirect=["loops"],
+)
+def test_quadrature_is_an_independent_witness(file_of, file, loops):
     mesh = exactness.read_mesh(file_of(file), FIELDS.get(file), np.float64)
     reference = BruteForce(mesh)
     rays = exactness.make_rays(mesh, reference, "random", 100, np.random.default_rng(0))
@@ -114,8 +134,13 @@ def test_quadrature_is_an_independent_witness(file_of, file):
     assert found["worst"] <= 1e-10, found
 
 
-@pytest.mark.parametrize("file", named("football_zoo.vtu", "beam.vtu"))
-def test_lost_rays_on_a_small_mesh(file_of, file, dtype):
+@pytest.mark.parametrize(
+    "file, loops, dtype",
+    crossed("football_zoo.vtu", itertools.product(("compiled", "jax"), DTYPES))
+    + crossed("beam.vtu", [("compiled", "float64"), ("jax", "float32")]),
+    indirect=["loops"],
+)
+def test_lost_rays_on_a_small_mesh(file_of, file, loops, dtype):
     found = lost_rays.run_mesh(file_of(file), dtype, 1000, 1, {}, FIELDS.get(file))
     assert found["status"] == 0
     assert found["differ_clear"] == 0, found

@@ -36,8 +36,8 @@ def session(tmp_path):
     clone.mkdir(parents=True)
     shutil.copy(Path(__file__).with_name("outside.py"), clone)
     (clone.parent / "experiments").mkdir()
-    for module in (experiments, experiments.data):
-        shutil.copy(module.__file__, clone.parent / "experiments")
+    for name in ("__init__.py", "data.py"):
+        shutil.copy(Path(experiments.data.__file__).with_name(name), clone.parent / "experiments")
     (clone / "conftest.py").write_text(
         "import outside\n"
         "def pytest_configure(config):\n"

@@ -39,9 +39,7 @@ def test_whole_segments():
     assert np.allclose(got, colors_of(Analytic(), TF, segment), rtol=0, atol=2e-14)
 
 
-@pytest.mark.parametrize(
-    "file", named("vectors/segment_vectors_public.npz", "vectors/slabs.npz")
-)
+@pytest.mark.parametrize("file", named("vectors/segment_vectors_public.npz", "vectors/slabs.npz"))
 def test_slab_against_vectors(file_of, file):
     """Slabs of moderate depth: beyond, a fixed rule does not see where the light comes from."""
     data = np.load(file_of(file))
