@@ -152,8 +152,13 @@ def cells(path: Path) -> None:
 
 
 def pipe(path: Path) -> None:
+    """On one side of the seam points are numbered inwards, on the other outwards."""
     grid = ring(0.5)
-    write_vtu(path, grid.points, {"hexahedron": grid.hexahedra}, flow_fields(grid.points))
+    number = np.arange(len(grid.points)).reshape(grid.dims[::-1])
+    number[:, -1] = number[:, -1, ::-1]
+    number = number.ravel()
+    points = grid.points[number]  # pairs are exchanged: that is its own inverse
+    write_vtu(path, points, {"hexahedron": number[grid.hexahedra]}, flow_fields(points))
 
 
 def tube(path: Path) -> None:
