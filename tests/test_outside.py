@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import experiments.data
+from experiments import exactness, lost_rays
 
 TESTS = """
 import pytest
@@ -114,3 +115,12 @@ def test_experiments_know_the_same_folders(tmp_path):
     ):
         with pytest.raises(FileNotFoundError, match=words):
             experiments.data.path_of("vectors/v.npz", environment)
+
+
+@pytest.mark.parametrize("script", [exactness, lost_rays], ids=lambda x: x.__name__)
+def test_scripts_say_that_there_are_no_data(script, monkeypatch, capsys):
+    monkeypatch.setenv("JAXVR_DATA", "none")
+    with pytest.raises(SystemExit) as ended:
+        script.main([])
+    assert ended.value.code == 2
+    assert "bluntfin.vtu is not at hand: JAXVR_DATA is none" in capsys.readouterr().err
