@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 import warnings
@@ -33,13 +32,10 @@ import jax
 import jax.numpy as jnp
 
 import jaxvr
+from experiments.data import meshes_of, path_of
 from jaxvr.testing.brute import BruteForce
 from jaxvr.volume import read_mesh
 from jaxvr.volume.connectivity import FACES
-
-ROOT = Path(__file__).resolve().parents[1]
-DATA = Path(os.environ.get("JAXVR_DATA", ROOT.parent / "shared" / "data"))
-VECTORS = Path(os.environ.get("JAXVR_VECTORS", ROOT.parent / "shared" / "vectors"))
 
 FIELDS = {
     "bluntfin": "density",
@@ -212,20 +208,22 @@ def compare(
     }
 
 
-def run_mesh(name: str, dtype: str, rays: int, location: str | None = None) -> dict[str, Any]:
+def run_mesh(
+    path: Path, dtype: str, rays: int, location: str | None = None, field: str | None = None
+) -> dict[str, Any]:
     """All families on one mesh; `location` turns its point data into cell or corner data."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # inverted cells are counted elsewhere
-        mesh = read_mesh(DATA / f"{name}.vtu", FIELDS[name], np.dtype(dtype))
+        mesh = read_mesh(path, field, np.dtype(dtype))
     if location is not None:
         mesh = at_location(mesh, location)
     reference = BruteForce(mesh)
     rng = np.random.default_rng(0)
     each = -(-rays // len(FAMILIES))
     families = {k: make_rays(mesh, reference, k, each, rng) for k in FAMILIES}
-    if name == "hexa_lattice":
+    if path.stem == "hexa_lattice":
         families["lattice"] = lattice_rays(mesh, reference)
-    return {"mesh": name, "location": mesh.location, **compare(mesh, families)}
+    return {"mesh": path.stem, "location": mesh.location, **compare(mesh, families)}
 
 
 def at_location(mesh: Any, location: str) -> Any:
@@ -293,6 +291,7 @@ def main(arguments: Any = None) -> list[dict[str, Any]]:
     options = parser.parse_args(arguments)
     if options.tiny:
         options.meshes, options.rays = list(TINY), 400
+    files = meshes_of(options.meshes, parser)
     jax.config.update("jax_enable_x64", True)
     results = []
     print("largest difference of rgba from brute force")
@@ -300,9 +299,9 @@ def main(arguments: Any = None) -> list[dict[str, Any]]:
         f"{'mesh':16}{'dtype':9}{'rays':>8}{'hit':>6}{'alpha':>7}{'median':>9}{'99.99 %':>9}"
         f"{'worst':>9}{'(alpha)':>9}{'off':>5}{'vague':>6}{'lost':>5}"
     )
-    for name in options.meshes:
+    for name, path in files.items():
         for dtype in options.dtypes:
-            r = run_mesh(name, dtype, options.rays, options.location)
+            r = run_mesh(path, dtype, options.rays, options.location, FIELDS[name])
             results.append(r)
             print(
                 f"{name:16}{dtype:9}{r['rays']:8}{r['hit']:6.2f}{r['mean_alpha']:7.3f}"
@@ -312,8 +311,11 @@ def main(arguments: Any = None) -> list[dict[str, Any]]:
             )
     print("off: rays beyond 1e-10 (float64) or 2e-5 (float32); vague: ambiguous ones, left out;")
     print("lost: rays with a status bit")
-    vectors = VECTORS / "segment_vectors_public.npz"
-    if vectors.exists():
+    try:
+        vectors = path_of("vectors/segment_vectors_public.npz")
+    except FileNotFoundError as error:
+        print(error)
+    else:
         for dtype in options.dtypes:
             r = {"slab": dtype, **check_slab(vectors, dtype)}
             results.append(r)
@@ -322,8 +324,6 @@ def main(arguments: Any = None) -> list[dict[str, Any]]:
                     f"{k} {v:.1e}" if isinstance(v, float) else f"{k} {v}" for k, v in r.items()
                 )
             )
-    else:
-        print(f"no vectors at {vectors}: set JAXVR_VECTORS")
     if options.json:
         options.json.write_text(json.dumps(results, indent=1) + "\n")
     return results

@@ -35,10 +35,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.data import meshes_of
 from jaxvr.testing.brute import AROUND, BruteForce
 
-ROOT = Path(__file__).resolve().parents[1]
-DATA = Path(os.environ.get("JAXVR_DATA", ROOT.parent / "shared" / "data"))
 FIELDS = {"bluntfin": "density", "oxygen_post": "speed", "football_zoo": None}
 TOLERANCE = {"float32": 1e-4, "float64": 1e-9}
 NUDGE = {"float32": 1e-7, "float64": 2e-16}
@@ -89,7 +88,9 @@ def aim(corners: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndar
     return eye, target, aimed
 
 
-def run_mesh(name: str, dtype: str, count: int, processes: int, known: dict) -> dict[str, Any]:
+def run_mesh(
+    path: Path, dtype: str, count: int, processes: int, known: dict, field: str | None = None
+) -> dict[str, Any]:
     """Counts for one mesh; `known` keeps the lengths of the rays that both dtypes share."""
     import jax
 
@@ -98,7 +99,7 @@ def run_mesh(name: str, dtype: str, count: int, processes: int, known: dict) -> 
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        mesh = read_mesh(DATA / f"{name}.vtu", FIELDS[name], np.dtype(dtype))
+        mesh = read_mesh(path, field, np.dtype(dtype))
     points = np.asarray(mesh.points, np.float64)
     corners = points[np.asarray(mesh.cells)]
     diagonal = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
@@ -151,7 +152,7 @@ def run_mesh(name: str, dtype: str, count: int, processes: int, known: dict) -> 
     hit = exact > 0
     del jax
     return {
-        "mesh": name,
+        "mesh": path.stem,
         "dtype": dtype,
         "rays": count,
         "aimed": int(aimed.sum()),
@@ -182,6 +183,7 @@ def main(arguments: Any = None) -> list[dict[str, Any]]:
     options = parser.parse_args(arguments)
     import jax
 
+    files = meshes_of(options.meshes, parser)
     jax.config.update("jax_enable_x64", True)
     results, known = [], {}
     print("rays whose length is off by more than 1e-4 (float32) or 1e-9 (float64), relative")
@@ -189,9 +191,10 @@ def main(arguments: Any = None) -> list[dict[str, Any]]:
         f"{'mesh':13}{'dtype':9}{'rays':>9}{'hit':>9}{'median':>9}{'lost':>6}{'differ':>8}"
         f"{'vague':>7}{'aimed':>7}{'long':>6}{'clear':>7}{'worst long':>12}{'worst/size':>12}"
     )
-    for name in options.meshes:
+    for name, path in files.items():
         for dtype in options.dtypes:
-            r = run_mesh(name, dtype, options.rays, options.processes, known)
+            field = FIELDS.get(name)
+            r = run_mesh(path, dtype, options.rays, options.processes, known, field)
             results.append(r)
             print(
                 f"{name:13}{dtype:9}{r['rays']:9}{r['hit']:9}{r['median']:9.1e}{r['status']:6}"

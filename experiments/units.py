@@ -15,6 +15,7 @@ same, and what pictures outside of it are: an error in words, or a picture that 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import warnings
 from pathlib import Path
@@ -29,7 +30,7 @@ from experiments.common import table
 
 # Beyond the exponents of subnormal and of the largest numbers.
 REACH = {"float32": 152, "float64": 1078}
-# Powers of the scalar's and of the length's unit in each number.
+# What the numbers of each are multiplied with, as powers of the scalar's and of the length's unit.
 POWERS = {
     "values": (1, 0),
     "points": (0, 1),
@@ -41,18 +42,23 @@ POWERS = {
 }
 
 
-class Picture:
-    """A jittered box across two jumps, in any units."""
+@dataclasses.dataclass
+class Setting:
+    """A jittered box across two jumps, and the numbers of its picture in other units."""
 
-    def __init__(self, dtype: str, size: int, parallel: bool = False, native: bool = True):
+    dtype: str
+    parallel: bool = False
+    blocks: tuple[int, int, int] = (4, 3, 3)
+    width: int = 48
+    height: int = 48
+
+    def __post_init__(self):
         rng = np.random.default_rng(0)
-        self.dtype, self.size, self.parallel = dtype, size, parallel
-        self.adjoint = jaxvr.Replay(native=native)
         self.mesh = jaxvr.datasets.box(
-            (4, 3, 3),
+            self.blocks,
             jitter=0.2,
             seed=1,
-            dtype=dtype,
+            dtype=self.dtype,
             field=lambda p: p[:, 0] + 0.4 * np.sin(3 * p[:, 1]) - 0.3 * p[:, 2],
         )
         numbers = {
@@ -63,50 +69,66 @@ class Picture:
             "extinctions": rng.uniform(0.3, 6, 6),
             "eye": [1.9, 1.4, 2.3],
             "target": [0.5, 0.5, 0.5],
+            "size": 1.5 if self.parallel else 32.0,  # extent, a length, or fov
         }
-        self.numbers = {k: np.asarray(x, dtype) for k, x in numbers.items()}
-        self.extent = np.asarray(1.6, dtype)
-        self.weights = rng.normal(size=(size, size, 4)).astype(dtype)
-        self.slopes = jax.jit(
-            jax.grad(lambda n, extent: (self.image(n, extent) * self.weights).sum())
-        )
+        self.numbers = {k: np.asarray(x, self.dtype) for k, x in numbers.items()}
 
-    def parts(self, numbers: dict[str, Any], extent: Any):
+    def power(self, name: str, scalar: int, length: int) -> int:
+        """The power of two that numbers of a name are multiplied with, where scalars are with
+        2^scalar and lengths are with 2^length."""
+        of_scalar, of_length = POWERS.get(name, (0, int(self.parallel)))
+        return of_scalar * scalar + of_length * length
+
+    def scaled(self, scalar: int = 0, length: int = 0) -> dict[str, np.ndarray]:
+        return {k: np.ldexp(x, self.power(k, scalar, length)) for k, x in self.numbers.items()}
+
+    def parts(self, numbers: dict[str, Any]) -> tuple[Any, Any, Any]:
+        """Volume, camera and transfer function, unchecked, so that it works under jit."""
         n = {k: jnp.asarray(x) for k, x in numbers.items()}
-        view = {"width": self.size, "height": self.size, "dtype": self.dtype}
-        if self.parallel:
-            up = (0.0, 1.0, 0.0)
-            camera = jaxvr.Camera.orthographic(n["eye"], n["target"], up, extent, **view)
-        else:
-            camera = jaxvr.Camera.look_at(n["eye"], n["target"], **view)
-        transfer = jaxvr.TransferFunction(n["positions"], n["colors"], n["extinctions"])
-        return self.mesh.replace(values=n["values"], points=n["points"]), camera, transfer
+        view = {"width": self.width, "height": self.height, "dtype": self.dtype}
+        camera = jaxvr.Camera.look_at((0, 0, 1), (0, 0, 0), **view)
+        camera = dataclasses.replace(
+            camera,
+            eye=n["eye"],
+            target=n["target"],
+            fov=None if self.parallel else n["size"],
+            extent=n["size"] if self.parallel else None,
+        )
+        transfer = jaxvr.TransferFunction([0.0], [[0, 0, 0]], [0.0], dtype=self.dtype)
+        fields = {k: n[k] for k in ("positions", "colors", "extinctions")}
+        mesh = dataclasses.replace(self.mesh, values=n["values"], points=n["points"])
+        return mesh, camera, dataclasses.replace(transfer, **fields)
 
-    def image(self, numbers: dict[str, Any], extent: Any) -> Any:
-        return jaxvr.render(*self.parts(numbers, extent), adjoint=self.adjoint)
+    def render(self, numbers: dict[str, Any], **nouns: Any) -> Any:
+        return jaxvr.render(*self.parts(numbers), **nouns)
 
-    def scaled(self, scalar: int, length: int) -> tuple[dict[str, np.ndarray], Any]:
-        numbers = {
-            k: np.ldexp(x, POWERS[k][0] * scalar + POWERS[k][1] * length)
-            for k, x in self.numbers.items()
-        }
-        return numbers, np.ldexp(self.extent, length)
+
+class Picture:
+    """What is looked at in each unit: pictures and gradients of a setting, as lists of arrays."""
+
+    def __init__(self, dtype: str, size: int, parallel: bool = False, native: bool = True):
+        self.setting = Setting(dtype, parallel, width=size, height=size)
+        self.adjoint = jaxvr.Replay(native=native)
+        weights = np.random.default_rng(1).normal(size=(size, size, 4)).astype(dtype)
+        self.slopes = jax.jit(jax.grad(lambda numbers: (self.image(numbers) * weights).sum()))
+
+    def image(self, numbers: dict[str, Any]) -> Any:
+        return self.setting.render(numbers, adjoint=self.adjoint)
 
     def render(self, scalar: int, length: int) -> list[np.ndarray]:
-        return [np.asarray(self.image(*self.scaled(scalar, length)))]
+        return [np.asarray(self.image(self.setting.scaled(scalar, length)))]
 
     def shade(self, scalar: int, length: int) -> list[np.ndarray]:
-        mesh, camera, transfer = self.parts(*self.scaled(scalar, length))
+        mesh, camera, transfer = self.setting.parts(self.setting.scaled(scalar, length))
         segments = jaxvr.trace(mesh, camera, native=self.adjoint.native)
         return [np.asarray(jaxvr.shade(segments, transfer, adjoint=self.adjoint))]
 
     def gradient(self, scalar: int, length: int) -> list[np.ndarray]:
-        self.image(*self.scaled(scalar, length))  # tells what is out of range
-        slopes = self.slopes(*self.scaled(scalar, length))
-        return [
-            np.ldexp(np.asarray(x), POWERS[k][0] * scalar + POWERS[k][1] * length)
-            for k, x in slopes.items()
-        ]
+        numbers = self.setting.scaled(scalar, length)
+        self.image(numbers)  # tells what is out of range
+        slopes = self.slopes(numbers)
+        power = self.setting.power
+        return [np.ldexp(np.asarray(x), power(k, scalar, length)) for k, x in slopes.items()]
 
 
 def attempt(make: Any, want: list[np.ndarray], scalar: int, length: int) -> str:

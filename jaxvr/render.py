@@ -24,11 +24,10 @@ from jax import lax
 from jaxvr import hints
 from jaxvr import native as compiled
 from jaxvr._core.checks import is_concrete
-from jaxvr._core.modes import custom_vjp_refused
 from jaxvr._core.status import BROKEN, LOST, check
 from jaxvr.adjoint import AbstractAdjoint, Pipeline
-from jaxvr.adjoint.base import Operands
-from jaxvr.adjoint.replay import FORWARD_MODE, settle
+from jaxvr.adjoint.base import Operands, refusing
+from jaxvr.adjoint.replay import settle
 from jaxvr.arguments import (
     adjoint_of,
     background_of,
@@ -112,7 +111,7 @@ def render(
     camera = camera_of(camera, volume_of(volume))
     transfer = transfer_of(transfer, volume)
     how = _how(pipeline, adjoint, budget, volume)
-    with custom_vjp_refused(FORWARD_MODE):
+    with refusing(how[1]):
         image, bits, seen = _render(*how, volume, camera, transfer, background_of(background))
     if status:
         return image, bits
@@ -153,7 +152,7 @@ def render_rays(
     origins, directions = rays_of(origins, directions, volume_of(volume))
     transfer = transfer_of(transfer, volume)
     how = _how(pipeline, adjoint, budget, volume)
-    with custom_vjp_refused(FORWARD_MODE):
+    with refusing(how[1]):
         rgba, bits = _render_rays(
             *how, volume, origins, directions, transfer, background_of(background)
         )
@@ -247,7 +246,7 @@ def shade(
     pipeline = _pipeline(Recorded(), integrator, compositor)
     transfer = transfer_of(transfer, segments)
     how = _how(pipeline, adjoint, budget, segments)
-    with custom_vjp_refused(FORWARD_MODE):
+    with refusing(how[1]):
         image, bits = _shade(*how, segments, transfer, background_of(background))
     if is_concrete(bits):
         check(bits)

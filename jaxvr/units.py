@@ -81,13 +81,13 @@ def mesh_in(units: Units, volume: Any) -> Any:
 
 
 def transfer_in(units: Units, transfer: TransferFunction) -> TransferFunction:
-    """A transfer function in such units. An extinction that overflows there hides all behind it
-    within no length at all, and stays finite."""
+    """A transfer function in such units, which are those of its own positions: their status says
+    whether these ascend. An extinction that overflows there hides all behind it within no length at
+    all, and stays finite."""
     most = jnp.asarray(jnp.finfo(transfer.extinctions.dtype).max / 8, transfer.extinctions.dtype)
     # Pieces of a segment go from one position to the next, which would not end among these.
-    positions = jnp.where(
-        _is_ascending(transfer.positions), transfer.positions, _ascending(transfer.positions)
-    )
+    unsorted = (units.status & UNSORTED) != 0
+    positions = jnp.where(unsorted, _ascending(transfer.positions), transfer.positions)
     return dataclasses.replace(
         transfer,
         positions=positions * units.scalar,

@@ -27,6 +27,7 @@ import jax
 import outside
 import pytest
 from rooms import *  # noqa: F403 (hooks of pytest)
+from stand_ins import file_of  # noqa: F401 (a fixture)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -1,12 +1,12 @@
 """Tests on data that are not in the repository run where the data are, and elsewhere are left out.
 
 A test names its files: `@pytest.mark.outside("can.vtu")`, or `"vectors/NAME"` for one of the
-reference segments, and gets their paths from the fixture `data_path`. The folders are `JAXVR_DATA`
-and `JAXVR_VECTORS`, or else `shared/data` and `shared/vectors` beside the checkout.
+reference segments, and gets their paths from the fixture `data_path`. `experiments/data.py` says
+which folders these are.
 
 Folder not there: its tests are left out, and counted in the closing lines; with `CI=true` it is an
-error of the session, unless `JAXVR_DATA=none` says that this is meant. (`none` speaks for both
-folders where `JAXVR_VECTORS` is not set.) File not there, in a folder that is: the test fails.
+error of the session, unless `JAXVR_DATA=none` says that this is meant. File not there, in a folder
+that is: the test fails. What takes the place of such files anywhere is in `stand_ins`.
 """
 
 from __future__ import annotations
@@ -18,24 +18,9 @@ from pathlib import Path
 
 import pytest
 
-BESIDE = Path(__file__).resolve().parents[2] / "shared"
-VARIABLES = {"data": "JAXVR_DATA", "vectors": "JAXVR_VECTORS"}
+from experiments.data import VARIABLES, folder, locate, path_of
 
 lacking: dict[str, int] = {}  # "tests", and for each file the tests that need it
-
-
-def folder(kind: str, environment: Mapping[str, str] = os.environ) -> Path | None:
-    """The folder of "data" or "vectors", whether it is there or not; None where none is wanted."""
-    named = environment.get(VARIABLES[kind], "")
-    if "none" in (named, named or environment.get("JAXVR_DATA", "")):
-        return None
-    return Path(named) if named else BESIDE / kind
-
-
-def locate(name: str) -> tuple[str, str]:
-    """Kind of folder, and path inside of it, of a name as tests give it."""
-    kind, _, rest = name.partition("/")
-    return ("vectors", rest) if kind == "vectors" else ("data", name)
 
 
 def is_there(kind: str) -> bool:
@@ -48,11 +33,10 @@ def data_path():
     """Path of a file of the outside data; the test fails, loudly, where it is missing."""
 
     def find(name: str) -> Path:
-        kind, rest = locate(name)
-        place = folder(kind)
-        if place is None or not (place / rest).exists():
-            pytest.fail(f"{name} is missing in {place}: see {VARIABLES[kind]} in tests/outside.py.")
-        return place / rest
+        try:
+            return path_of(name)
+        except FileNotFoundError as error:
+            pytest.fail(str(error))
 
     return find
 

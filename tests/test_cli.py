@@ -12,6 +12,7 @@ import pytest
 
 import jaxvr
 from jaxvr.cli import main
+from tests.stand_ins import flow_fields, named, ring
 
 pytestmark = pytest.mark.usefixtures("quick_code")
 
@@ -40,12 +41,18 @@ def test_info(mesh, capsys):
     assert "values (point)" in out and "48 tetrahedra" in out
 
 
-@pytest.mark.outside("plot3d")
-def test_info_plot3d(data_path, capsys):
-    folder = data_path("plot3d")
-    grid = next(p for p in sorted(folder.iterdir()) if "xyz" in p.name)
-    assert main(["info", str(grid), "--field", "y"]) == 0
-    assert "224," in capsys.readouterr().out
+@pytest.mark.parametrize("file", named("plot3d/bluntfinxyz.bin", "tube.xyz"))
+def test_info_plot3d(file_of, file, capsys):
+    count = {"tube.xyz": "210 tetrahedra"}.get(file, "224,759 tetrahedra")
+    assert main(["info", str(file_of(file)), "--field", "y"]) == 0
+    assert count in capsys.readouterr().out
+
+
+def test_info_plot3d_solution(file_of, capsys):
+    files = [str(file_of(name)) for name in ("tube.xyz", "tube.q")]
+    assert main(["info", files[0], "--q", files[1], "--field", "pressure"]) == 0
+    out, want = capsys.readouterr().out, flow_fields(ring(0.0).points)["pressure"]
+    assert "pressure" in out and f"{want.min():.4g}" in out and f"{want.max():.4g}" in out, out
 
 
 def test_render_png_is_transparent_and_npy_is_exact(mesh, tf, tmp_path, capsys):

@@ -1,12 +1,13 @@
 """Rendering against brute force on small meshes, the slab against its vectors, and brute force
 against what can be said in closed form.
 
-The meshes, rays and comparison are those of `experiments/exactness.py`, which runs them on all of
-the real data.
+The rays and the comparison are those of `experiments/exactness.py`, which runs them on all of the
+real data.
 """
 
 from __future__ import annotations
 
+import itertools
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ import jaxvr
 from experiments import exactness, lost_rays
 from jaxvr.testing.brute import BruteForce
 from jaxvr.volume import datasets
+from tests.stand_ins import named
 
 pytestmark = pytest.mark.usefixtures("loops")
 
@@ -74,11 +76,29 @@ def test_reference_counts_a_ray_in_shared_faces_once():
     np.testing.assert_allclose(found, 1.0, rtol=1e-14)
 
 
-@pytest.mark.outside("football_zoo.vtu")
-@pytest.mark.parametrize("location", [None, "cell", "corner"])
-def test_zoo_cells(data_path, dtype, location):
-    data_path("football_zoo.vtu")
-    found = exactness.run_mesh("football_zoo", dtype, 800, location)
+def crossed(file, cases):
+    """Parameters: a file with cases of others, of which the first says which loops run."""
+    (entry,) = named(file)
+    return [pytest.param(file, *case, marks=entry.marks) for case in cases]
+
+
+FIELDS = {"beam.vtu": "sample_point_scalars"}
+DTYPES, LOCATIONS = ("float32", "float64"), (None, "cell", "corner")
+ALL = list(itertools.product(("compiled", "jax"), DTYPES, LOCATIONS))
+# JAX's loops compile for ten seconds each time.
+SOME = [("compiled", "float32", None), ("compiled", "float32", "cell")]
+SOME += [("compiled", "float64", None), ("compiled", "float64", "corner")]
+SOME += [("jax", "float32", "corner"), ("jax", "float64", None)]
+
+
+@pytest.mark.parametrize(
+    "file, loops, dtype, location",
+    crossed("football_zoo.vtu", ALL) + crossed("beam.vtu", SOME),
+    indirect=["loops"],
+)
+def test_zoo_cells(file_of, file, loops, dtype, location):
+    rays = 800 if file == "football_zoo.vtu" else 400
+    found = exactness.run_mesh(file_of(file), dtype, rays, location, FIELDS.get(file))
     assert found["status"] == 0
     assert found["worst"] <= WORST[dtype], found
     # only rays in the boundary or, for discontinuous data, in faces are left out
@@ -101,29 +121,36 @@ def test_lattice_seen_exactly_along_its_axes(dtype):
     assert found["worst"] <= WORST[dtype], found
 
 
-@pytest.mark.outside("football_zoo.vtu")
-def test_quadrature_is_an_independent_witness(data_path):
-    data_path("football_zoo.vtu")
-    mesh = exactness.read_mesh(data_path("football_zoo.vtu"), None, np.float64)
+@pytest.mark.parametrize(
+    "file, loops",
+    crossed("football_zoo.vtu", [("compiled",), ("jax",)]) + crossed("beam.vtu", [("compiled",)]),
+    indirect=["loops"],
+)
+def test_quadrature_is_an_independent_witness(file_of, file, loops):
+    mesh = exactness.read_mesh(file_of(file), FIELDS.get(file), np.float64)
     reference = BruteForce(mesh)
     rays = exactness.make_rays(mesh, reference, "random", 100, np.random.default_rng(0))
     found = exactness.compare(mesh, {"random": rays}, integrator=jaxvr.Quadrature(samples=12))
     assert found["worst"] <= 1e-10, found
 
 
-@pytest.mark.outside("football_zoo.vtu")
-def test_lost_rays_on_a_small_mesh(data_path, dtype):
-    data_path("football_zoo.vtu")
-    found = lost_rays.run_mesh("football_zoo", dtype, 1000, 1, {})
+@pytest.mark.parametrize(
+    "file, loops, dtype",
+    crossed("football_zoo.vtu", itertools.product(("compiled", "jax"), DTYPES))
+    + crossed("beam.vtu", [("compiled", "float64"), ("jax", "float32")]),
+    indirect=["loops"],
+)
+def test_lost_rays_on_a_small_mesh(file_of, file, loops, dtype):
+    found = lost_rays.run_mesh(file_of(file), dtype, 1000, 1, {}, FIELDS.get(file))
     assert found["status"] == 0
     assert found["differ_clear"] == 0, found
 
 
-@pytest.mark.outside("vectors/segment_vectors_public.npz")
+@pytest.mark.parametrize("file", named("vectors/segment_vectors_public.npz", "vectors/slabs.npz"))
 @pytest.mark.parametrize(
     "dtype, value, slope", [("float64", 1e-15, 5e-15), ("float32", 5e-7, 7e-7)]
 )
-def test_slab_against_vectors(data_path, dtype, value, slope):
-    found = exactness.check_slab(data_path("vectors/segment_vectors_public.npz"), dtype)
+def test_slab_against_vectors(file_of, file, dtype, value, slope):
+    found = exactness.check_slab(file_of(file), dtype)
     assert found["rgb"] <= value and found["alpha"] <= value, found
     assert found["jacfwd"] <= slope and found["jacrev"] <= slope, found

@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+import experiments.data
+from experiments import exactness, lost_rays
+
 TESTS = """
 import pytest
 
@@ -33,6 +36,9 @@ def session(tmp_path):
     clone = tmp_path / "folder" / "clone" / "tests"
     clone.mkdir(parents=True)
     shutil.copy(Path(__file__).with_name("outside.py"), clone)
+    (clone.parent / "experiments").mkdir()
+    for name in ("__init__.py", "data.py"):
+        shutil.copy(Path(experiments.data.__file__).with_name(name), clone.parent / "experiments")
     (clone / "conftest.py").write_text(
         "import outside\n"
         "def pytest_configure(config):\n"
@@ -44,6 +50,7 @@ def session(tmp_path):
         ours = ("CI", "JAXVR_DATA", "JAXVR_VECTORS")
         env = {k: v for k, v in os.environ.items() if k not in ours and "PYTEST" not in k}
         command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-q", *options]
+        command += ["-o", f"pythonpath={clone.parent}"]
         done = subprocess.run(
             command, cwd=clone, env=env | variables, capture_output=True, text=True, timeout=120
         )
@@ -94,3 +101,26 @@ def test_folder_that_lacks_a_file_fails_and_names_it(session):
     (session.beside / "vectors" / "v.npz").touch()
     code, told = session(CI="true")
     assert code == 0 and "5 passed" in told
+
+
+def test_experiments_know_the_same_folders(tmp_path):
+    """`none` is no folder of that name, wherever a script is started."""
+    (tmp_path / "can.vtu").touch()
+    found = experiments.data.path_of("can.vtu", {"JAXVR_DATA": str(tmp_path)})
+    assert found == tmp_path / "can.vtu"
+    for environment, words in (
+        ({"JAXVR_DATA": "none"}, "JAXVR_VECTORS is none"),
+        ({"JAXVR_DATA": str(tmp_path), "JAXVR_VECTORS": "none"}, "JAXVR_VECTORS is none"),
+        ({"JAXVR_DATA": "none", "JAXVR_VECTORS": str(tmp_path)}, f"v.npz is missing in {tmp_path}"),
+    ):
+        with pytest.raises(FileNotFoundError, match=words):
+            experiments.data.path_of("vectors/v.npz", environment)
+
+
+@pytest.mark.parametrize("script", [exactness, lost_rays], ids=lambda x: x.__name__)
+def test_scripts_say_that_there_are_no_data(script, monkeypatch, capsys):
+    monkeypatch.setenv("JAXVR_DATA", "none")
+    with pytest.raises(SystemExit) as ended:
+        script.main([])
+    assert ended.value.code == 2
+    assert "bluntfin.vtu is not at hand: JAXVR_DATA is none" in capsys.readouterr().err

@@ -12,64 +12,14 @@ import numpy as np
 import pytest
 
 import jaxvr
+from experiments.units import POWERS, Setting
 from jaxvr._core.units import SMALL, exponent_of, near_one, power_of_two
 
 pytestmark = pytest.mark.usefixtures("quick_code")
 
-NAMES = ("values", "points", "positions", "colors", "extinctions", "eye", "target", "size")
-# What the numbers of each are multiplied with, as powers of the scalar's and of the length's unit.
-POWERS = {"values": (1, 0), "points": (0, 1), "positions": (1, 0), "extinctions": (0, -1)}
-POWERS |= {"eye": (0, 1), "target": (0, 1)}
 
-
-@dataclasses.dataclass
-class Setting:
-    """A jittered box across a jump, and the numbers of its picture in other units."""
-
-    dtype: str
-    parallel: bool = False
-
-    def __post_init__(self):
-        rng = np.random.default_rng(0)
-        self.mesh = jaxvr.datasets.box(
-            (2, 2, 2), jitter=0.2, seed=1, dtype=self.dtype,
-            field=lambda p: p[:, 0] + 0.4 * np.sin(3 * p[:, 1]) - 0.3 * p[:, 2],
-        )  # fmt: skip
-        self.numbers = {
-            "values": self.mesh.values,
-            "points": self.mesh.points,
-            "positions": [-0.1, 0.1, 0.4, 0.4, 0.9, 1.2],
-            "colors": rng.uniform(0, 1, (6, 3)),
-            "extinctions": rng.uniform(0.3, 6, 6),
-            "eye": [1.9, 1.4, 2.3],
-            "target": [0.5, 0.5, 0.5],
-            "size": 1.5 if self.parallel else 32.0,  # extent, a length, or fov
-        }
-        self.numbers = {k: np.asarray(x, self.dtype) for k, x in self.numbers.items()}
-
-    def units(self, name: str, scalar: int, length: int):
-        is_extent = name == "size" and self.parallel
-        of_scalar, of_length = (0, 1) if is_extent else POWERS.get(name, (0, 0))
-        return np.ldexp(np.ones((), self.dtype), of_scalar * scalar + of_length * length)
-
-    def scaled(self, scalar: int = 0, length: int = 0):
-        return {k: x * self.units(k, scalar, length) for k, x in self.numbers.items()}
-
-    def parts(self, numbers):
-        """Volume, camera and transfer function, unchecked, so that it works under jit."""
-        n = {k: jnp.asarray(x) for k, x in numbers.items()}
-        size = {"extent": n["size"]} if self.parallel else {"fov": n["size"]}
-        camera = jaxvr.Camera.look_at((0, 0, 1), (0, 0, 0), width=6, height=5, dtype=self.dtype)
-        camera = dataclasses.replace(
-            camera, eye=n["eye"], target=n["target"], **{"fov": None, "extent": None, **size}
-        )
-        transfer = jaxvr.TransferFunction([0.0], [[0, 0, 0]], [0.0], dtype=self.dtype)
-        fields = {k: n[k] for k in ("positions", "colors", "extinctions")}
-        mesh = dataclasses.replace(self.mesh, values=n["values"], points=n["points"])
-        return mesh, camera, dataclasses.replace(transfer, **fields)
-
-    def render(self, numbers, **nouns):
-        return jaxvr.render(*self.parts(numbers), **nouns)
+def setting_of(dtype: str, parallel: bool = False) -> Setting:
+    return Setting(dtype, parallel, blocks=(2, 2, 2), width=6, height=5)
 
 
 def exponents(dtype: str) -> list[int]:
@@ -86,7 +36,7 @@ def steps(dtype: str) -> list[tuple[int, int]]:
 @pytest.mark.parametrize("parallel", [False, True], ids=["pinhole", "parallel"])
 @pytest.mark.parametrize("native", [True, False], ids=["compiled", "jax"])
 def test_picture_has_the_same_bits_in_any_unit(dtype, parallel, native):
-    setting, adjoint = Setting(dtype, parallel), jaxvr.Replay(native=native)
+    setting, adjoint = setting_of(dtype, parallel), jaxvr.Replay(native=native)
     want = np.asarray(setting.render(setting.scaled(), adjoint=adjoint))
     assert np.ptp(want[..., 3]) > 0.5
     for scalar, length in steps(dtype):
@@ -95,19 +45,19 @@ def test_picture_has_the_same_bits_in_any_unit(dtype, parallel, native):
 
 
 def test_traced_segments_and_probes_have_the_same_bits(dtype):
-    setting = Setting(dtype)
+    setting = setting_of(dtype)
     want = None
     for scalar, length in [(0, 0), *steps(dtype)]:
         mesh, camera, transfer = setting.parts(setting.scaled(scalar, length))
         segments = jaxvr.trace(mesh, camera)
         probe = jaxvr.probe(mesh, camera, transfer, (2, 3))
-        per = [setting.units(k, scalar, length) for k in ("values", "points")]
+        back = [-setting.power(k, scalar, length) for k in ("values", "points")]
         got = [
             jaxvr.shade(segments, transfer),
-            segments.scalar / per[0],
-            segments.length / per[1],
-            probe.scalars / per[0],
-            probe.distances / per[1],
+            np.ldexp(segments.scalar, back[0]),
+            np.ldexp(segments.length, back[1]),
+            np.ldexp(probe.scalars, back[0]),
+            np.ldexp(probe.distances, back[1]),
             probe.contributions,
         ]
         got = [np.asarray(x) for x in got]
@@ -118,7 +68,7 @@ def test_traced_segments_and_probes_have_the_same_bits(dtype):
 
 def test_gradients_have_the_same_bits_in_any_unit(dtype):
     """Those by a number in another unit are in one over it."""
-    setting = Setting(dtype)
+    setting = setting_of(dtype)
     weights = jnp.asarray(np.random.default_rng(1).normal(size=(5, 6, 4)), dtype)
 
     @jax.jit
@@ -131,13 +81,13 @@ def test_gradients_have_the_same_bits_in_any_unit(dtype):
     for scalar, length in steps(dtype):
         got = slopes(setting.scaled(scalar, length))
         for name, x in got.items():
-            x = np.asarray(x) * setting.units(name, scalar, length)
+            x = np.ldexp(np.asarray(x), setting.power(name, scalar, length))
             np.testing.assert_array_equal(x, want[name], err_msg=f"{name}: {scalar}, {length}")
 
 
 @pytest.mark.parametrize("native", [True, False])
 def test_out_of_range_is_told(dtype, native):
-    setting, adjoint = Setting(dtype), jaxvr.Replay(native=native)
+    setting, adjoint = setting_of(dtype), jaxvr.Replay(native=native)
     b = SMALL[dtype]
     for exponent in (-b - 1, -b - 20):
         numbers = setting.scaled(exponent, 0)
@@ -150,7 +100,7 @@ def test_out_of_range_is_told(dtype, native):
 
 
 def test_out_of_range_is_told_by_all_verbs():
-    setting = Setting("float32")
+    setting = setting_of("float32")
     mesh, camera, transfer = setting.parts(setting.scaled(-101, 0))
     segments = jaxvr.trace(*setting.parts(setting.scaled())[:2])
     small = dataclasses.replace(segments, scalar=segments.scalar * np.float32(2.0**-101))
@@ -170,7 +120,7 @@ def test_out_of_range_is_told_by_all_verbs():
 
 
 def test_subnormal_numbers_are_not_taken_for_a_field_of_zeros():
-    setting = Setting("float32")
+    setting = setting_of("float32")
     numbers = setting.scaled()
     numbers["values"] = np.ldexp(numbers["values"], -130)
     numbers["positions"] = np.ldexp(numbers["positions"], -130)
@@ -180,7 +130,7 @@ def test_subnormal_numbers_are_not_taken_for_a_field_of_zeros():
 
 def test_large_scalars_and_any_ratio_of_field_and_positions():
     """The field has no upper bound but the largest float, and may be far from the positions."""
-    setting = Setting("float32")
+    setting = setting_of("float32")
     want = setting.render(setting.scaled())
     np.testing.assert_array_equal(setting.render(setting.scaled(126, 0)), want)
     for up, down in ((100, -20), (-90, 30), (0, -99), (127, -100)):
@@ -193,7 +143,7 @@ def test_large_scalars_and_any_ratio_of_field_and_positions():
 
 
 def test_extinctions_to_the_largest_float():
-    setting = Setting("float32")
+    setting = setting_of("float32")
     numbers = setting.scaled(0, 6)
     numbers["extinctions"] = np.full(6, np.finfo(np.float32).max, np.float32)
     image = np.asarray(setting.render(numbers))
@@ -202,7 +152,7 @@ def test_extinctions_to_the_largest_float():
 
 def test_in_the_units_of_physics():
     """Cross-sections in square metres, energies in joules, a cell of a crystal, a galaxy."""
-    setting = Setting("float64")
+    setting = setting_of("float64")
     want = np.asarray(setting.render(setting.scaled()))
     for scalar, length in ((1e-28, 1.0), (4e-21, 1.0), (1e-24, 5e-10), (1e38, 9e20)):
         numbers = {k: x.copy() for k, x in setting.scaled().items()}

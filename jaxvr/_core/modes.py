@@ -52,14 +52,14 @@ def once_by(x: jax.Array, tree: Any, message: str) -> jax.Array:
 
 
 @contextlib.contextmanager
-def custom_vjp_refused(message: str) -> Iterator[None]:
+def custom_vjp_refused(message: str | None) -> Iterator[None]:
     """Round a call of a function with a `custom_vjp`: JAX's error of forward mode becomes
-    TypeError(message). For what `reverse_only` cannot refuse: `jacfwd` under a user's own jit,
-    where batched tangents are looked at before any is computed."""
+    TypeError(message); None leaves it as it is. For what `reverse_only` cannot refuse: `jacfwd`
+    under a user's own jit, where batched tangents are looked at before any is computed."""
     try:
         yield
     except TypeError as error:
-        if "custom_vjp" not in str(error):
+        if message is None or "custom_vjp" not in str(error):
             raise
         raise TypeError(message) from error
 

@@ -9,13 +9,15 @@ its last ray.
 from __future__ import annotations
 
 import abc
+import contextlib
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxvr._core.modes import custom_vjp_refused
 from jaxvr.composite.over import Over
 from jaxvr.optics.integrator import AbstractIntegrator
 from jaxvr.optics.partition import Cursor
@@ -50,11 +52,22 @@ class March(NamedTuple):
 
 
 class AbstractAdjoint(abc.ABC):
-    """Supplies the loop along the rays, and thereby how it is differentiated."""
+    """Supplies the loop along the rays, and thereby how it is differentiated.
+
+    no_forward_mode: one with a `custom_vjp` says here what gives forward mode instead.
+    """
+
+    no_forward_mode: ClassVar[str | None] = None
 
     @abc.abstractmethod
     def run(self, pipeline: Pipeline, operands: Operands) -> tuple[Array, Array]:
         """Premultiplied RGBA (batches, 4, R) and status (batches, R)."""
+
+
+def refusing(adjoint: Any) -> contextlib.AbstractContextManager[None]:
+    """Round a call of a compiled function with that adjoint, or a user's own, which needs no base:
+    errors of derivatives that it cannot give are in its words."""
+    return custom_vjp_refused(getattr(adjoint, "no_forward_mode", None))
 
 
 def begin(pipeline: Pipeline, operands: Operands) -> March:

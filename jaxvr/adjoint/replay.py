@@ -27,7 +27,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +51,7 @@ from jaxvr.adjoint.base import (
 
 Array = jax.Array
 
-FORWARD_MODE = (
+_FORWARD_MODE = (
     "Replay gives reverse mode (grad, vjp, jacrev) only. For forward mode (jvp, jacfwd, linearize) "
     "render with adjoint=Forward(), or with adjoint=Direct(max_steps) on small problems."
 )
@@ -78,12 +78,13 @@ class Replay(AbstractAdjoint):
     """
 
     native: bool | None = None
+    no_forward_mode: ClassVar[str] = _FORWARD_MODE
 
     def run(self, pipeline, operands):
         dtype = jax.tree.leaves(operands.table)[0].dtype
         nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
         compiled = native.covers(self.native, dtype, *nouns)
-        return _replay(pipeline, compiled, reverse_only(operands, FORWARD_MODE))
+        return _replay(pipeline, compiled, reverse_only(operands, _FORWARD_MODE))
 
 
 def _flags(asked: Sequence[bool]) -> tuple[Array, ...]:

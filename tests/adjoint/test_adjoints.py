@@ -50,6 +50,28 @@ def test_modes_that_an_adjoint_does_not_have_are_errors(image):
         jax.jit(jax.grad(lambda t: image(t, jaxvr.Forward()).sum()))(transfer)
 
 
+class Own:
+    """A user's own adjoint with a `custom_vjp`, and no base."""
+
+    def run(self, pipeline, operands):
+        replay = jaxvr.Replay(native=False)
+        own = jax.custom_vjp(lambda x: replay.run(pipeline, x))
+        own.defvjp(lambda x: (own(x), None), lambda _, bar: (None,))
+        return own(operands)
+
+
+@pytest.mark.parametrize(
+    "adjoint, words", [(jaxvr.Replay(), r"Replay gives reverse mode"), (Own(), "custom_vjp")]
+)
+def test_errors_of_forward_mode_are_in_the_words_of_the_adjoint_that_was_asked(
+    image, adjoint, words
+):
+    transfer = registry.transfer_of("float64")
+    with pytest.raises(TypeError, match=words) as caught:
+        jax.jit(jax.jacfwd(lambda x: image(transfer.scaled(x), adjoint)))(1.0)
+    assert isinstance(adjoint, jaxvr.Replay) or "Replay gives" not in str(caught.value)
+
+
 def test_jacobian_and_gradient_under_vmap(image):
     """grad of a vmap is the sum of a vmap of grads."""
     transfer = registry.transfer_of("float64")

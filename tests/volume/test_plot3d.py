@@ -1,4 +1,4 @@
-"""PLOT3D in all the ways it is written, and the blunt fin."""
+"""PLOT3D in all the ways it is written, and as VTU: the blunt fin, and a tube."""
 
 import itertools
 
@@ -7,6 +7,8 @@ import pytest
 
 from jaxvr.volume import read_mesh, read_plot3d
 from jaxvr.volume.structured import grid_cells, right_handed
+from tests.stand_ins import named
+from tests.stand_ins import write_plot3d as write
 
 
 def grid(ni, nj, nk, shift=0.0):
@@ -21,31 +23,8 @@ def flow(p):
     return np.stack([1 + p[0] ** 2, p[1], p[2], -p[0], 5 + p[1]])
 
 
-def records(chunks, order, markers):
-    out = b""
-    for c in chunks:
-        mark = np.array(len(c), order + "u4").tobytes() if markers else b""
-        out += mark + c + mark
-    return out
-
-
-def write(path, blocks, order="<", markers=False, counted=False, width=4, solution=False):
-    """blocks: (dims, points (3, P), iblank or None)."""
-
-    def ints(x):
-        return np.asarray(x, order + "i4").tobytes()
-
-    def floats(x):
-        return np.asarray(x, f"{order}f{width}").tobytes()
-
-    chunks = [ints(len(blocks))] if counted else []
-    chunks.append(ints([d for dims, _, _ in blocks for d in dims]))
-    for _, p, iblank in blocks:
-        if solution:
-            chunks += [floats([2.95, 0, 2.1e6, 1.0]), floats(flow(p))]
-        else:
-            chunks.append(floats(p) + (b"" if iblank is None else ints(iblank)))
-    path.write_bytes(records(chunks, order, markers))
+def solution(blocks):
+    return [(dims, flow(p), None) for dims, p, *_ in blocks]
 
 
 @pytest.mark.parametrize("blank", [False, True])
@@ -65,7 +44,7 @@ def test_every_way_of_writing(tmp_path, two, blank):
         if two and not counted:
             continue
         write(xyz, data, order, markers, counted, width)
-        write(q, data, order, markers, counted, width, solution=True)
+        write(q, solution(data), order, markers, counted, width, solution=True)
         mesh = read_plot3d(xyz, q, "momentum.y")
         p = np.concatenate([p for _, p in blocks], 1).T
         assert mesh.dtype == np.dtype(f"f{width}")
@@ -82,7 +61,7 @@ def test_zero_bytes_behind_the_data(tmp_path):
     block = [(*grid(3, 3, 3), None)]
     xyz, q = tmp_path / "a.xyz", tmp_path / "a.q"
     write(xyz, block, ">")
-    write(q, block, ">", solution=True)
+    write(q, solution(block), ">", solution=True)
     for path in (xyz, q):
         path.write_bytes(path.read_bytes() + bytes(44))
     assert read_plot3d(xyz, q).report.field == "density"
@@ -95,7 +74,7 @@ def test_fields(tmp_path):
     dims, p = grid(3, 4, 3)
     xyz, q = tmp_path / "a.xyz", tmp_path / "a.q"
     write(xyz, [(dims, p, None)], width=8)
-    write(q, [(dims, p, None)], width=8, solution=True)
+    write(q, solution([(dims, p)]), width=8, solution=True)
     rho, mx, my, mz, e = flow(p)
     square = mx**2 + my**2 + mz**2
     for name, expected in {
@@ -142,7 +121,7 @@ def test_bad_files(tmp_path):
             read_plot3d(xyz)
     write(xyz, block)
     other = tmp_path / "b.q"
-    write(other, [(*grid(3, 3, 4), None)], solution=True)
+    write(other, solution([grid(3, 3, 4)]), solution=True)
     with pytest.raises(ValueError, match="do not belong together"):
         read_plot3d(xyz, other)
     write(xyz, [(*grid(3, 3, 1), None)])
@@ -157,19 +136,25 @@ def test_density_that_is_not_positive(tmp_path):
     dims, p = grid(3, 3, 3)
     write(tmp_path / "a.xyz", [(dims, p, None)])
     p[0, 4] = np.nan
-    write(tmp_path / "a.q", [(dims, p, None)], solution=True)
+    write(tmp_path / "a.q", solution([(dims, p)]), solution=True)
     with pytest.raises(ValueError, match="1 points have none, the first at index 4"):
         read_plot3d(tmp_path / "a.xyz", tmp_path / "a.q", "pressure")
 
 
-@pytest.mark.outside("plot3d/bluntfinxyz.bin", "plot3d/bluntfinq.bin", "bluntfin.vtu")
+@pytest.mark.parametrize(
+    "grid_file, solution_file, vtu_file",
+    named(
+        ("plot3d/bluntfinxyz.bin", "plot3d/bluntfinq.bin", "bluntfin.vtu"),
+        ("tube.xyz", "tube.q", "tube.vtu"),
+    ),
+)
 @pytest.mark.parametrize("field", ["density", "energy", "pressure", "speed", "momentum.y"])
-def test_blunt_fin_equals_its_vtu_file(data_path, field):
-    xyz, q = data_path("plot3d/bluntfinxyz.bin"), data_path("plot3d/bluntfinq.bin")
-    with pytest.warns(UserWarning, match="115 degenerate"):
-        mesh = read_plot3d(xyz, q, field)
-    with pytest.warns(UserWarning, match="115 degenerate"):
-        vtu = read_mesh(data_path("bluntfin.vtu"), field)
+def test_files_equal_their_vtu_file(file_of, grid_file, solution_file, vtu_file, field):
+    degenerate = {"bluntfin.vtu": "115 degenerate", "tube.vtu": "42 degenerate"}[vtu_file]
+    with pytest.warns(UserWarning, match=degenerate):
+        mesh = read_plot3d(file_of(grid_file), file_of(solution_file), field)
+    with pytest.warns(UserWarning, match=degenerate):
+        vtu = read_mesh(file_of(vtu_file), field)
     assert mesh.dtype == np.float32
     for name in ("points", "values", "cells", "neighbors", "boundary", "duplicates"):
         assert np.array_equal(getattr(mesh, name), getattr(vtu, name)), name

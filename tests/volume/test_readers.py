@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxvr.volume import Field, TetMesh, datasets, list_fields, read_mesh, write_mesh
+from tests.stand_ins import named
 
 RNG = np.random.default_rng(0)
 BOX = datasets.box((2, 2, 1), cell="hexahedron")
@@ -234,9 +235,9 @@ def test_damaged_files(tmp_path, suffix):
         attempt(path)
 
 
-@pytest.mark.outside("football_zoo.vtu")
-def test_truncated_real_file(data_path, tmp_path):
-    raw = data_path("football_zoo.vtu").read_bytes()
+@pytest.mark.parametrize("file", named("football_zoo.vtu", "beam.vtu", "cells.vtu"))
+def test_truncated_real_file(file_of, file, tmp_path):
+    raw = file_of(file).read_bytes()
     path = tmp_path / "cut.vtu"
     for n in range(0, len(raw) - 40, len(raw) // 20):
         path.write_bytes(raw[:n])
