@@ -21,11 +21,17 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 demo: $(VENV)/.package
 	$(BIN)/python -m experiments.demo --out output/demo
 
+# Nearly all the time of the tests goes into compiling, and most of them ask what is computed, not
+# how it is rounded: those do without LLVM's optimiser. The rest is compiled as it is for users.
+TESTS = $(BIN)/python -m pytest -n 2 --dist loadscope
+UNOPTIMISED = XLA_FLAGS="--xla_backend_optimization_level=0 $$XLA_FLAGS"
+
 test: lint
-	$(BIN)/python -m pytest -n 2 --dist loadscope
+	$(UNOPTIMISED) $(TESTS) -m "not optimised"
+	$(TESTS) -m optimised
 
 quick: lint
-	$(BIN)/python -m pytest -m rooms -n 2 --dist loadscope
+	$(UNOPTIMISED) $(TESTS) -m rooms
 
 pythons:
 	$(PYTHON) .ci/pythons.py

@@ -40,7 +40,9 @@ EMITTERS = accepted({"xla_cpu_use_fusion_emitters": False})
 UNOPTIMISED = accepted({"xla_backend_optimization_level": 0})
 jit = functools.partial(jax.jit, compiler_options=EMITTERS | UNOPTIMISED)
 # With LLVM's optimiser, which fuses products and sums: where those may be rounded once or twice.
-rounded_jit = functools.partial(jax.jit, compiler_options=EMITTERS)
+rounded_jit = functools.partial(
+    jax.jit, compiler_options=EMITTERS | {"xla_backend_optimization_level": 3}
+)
 
 # Functions of modules and their static arguments. (`jaxvr.render` and `jaxvr.probe` are functions.)
 STATIC = {

@@ -23,7 +23,7 @@ from jaxvr.testing.brute import BruteForce
 from jaxvr.volume import datasets
 from tests.stand_ins import named
 
-pytestmark = pytest.mark.usefixtures("loops")
+pytestmark = [pytest.mark.optimised, pytest.mark.usefixtures("loops")]
 
 WORST = {"float64": 1e-10, "float32": 2e-5}
 

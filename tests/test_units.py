@@ -15,7 +15,7 @@ import jaxvr
 from experiments.units import POWERS, Setting
 from jaxvr._core.units import SMALL, exponent_of, near_one, power_of_two
 
-pytestmark = pytest.mark.usefixtures("quick_code")
+pytestmark = [pytest.mark.optimised, pytest.mark.usefixtures("quick_code")]
 
 
 def setting_of(dtype: str, parallel: bool = False) -> Setting:

@@ -13,7 +13,7 @@ import pytest
 import jaxvr
 from jaxvr.volume import datasets
 
-pytestmark = pytest.mark.usefixtures("loops")
+pytestmark = [pytest.mark.optimised, pytest.mark.usefixtures("loops")]
 
 N = 4
 RAYS = 512

@@ -15,6 +15,7 @@ from jaxvr.volume import datasets
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize("native", [False, True])
 def test_memory_of_replay_does_not_grow_with_cells_per_ray(native):
     short, long = (datasets.box((1, 1, n), dtype="float32") for n in (4, 40))
@@ -26,6 +27,7 @@ def test_memory_of_replay_does_not_grow_with_cells_per_ray(native):
     assert replay[1] - replay[0] < 2 * (long.nbytes + hierarchy)
 
 
+@pytest.mark.optimised
 def test_memory_of_direct_does():
     mesh = datasets.box((1, 1, 4), dtype="float32")
     few, many = (reserved(mesh, 32, jaxvr.Direct(max_steps=n)) for n in (16, 64))

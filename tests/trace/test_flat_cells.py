@@ -43,6 +43,7 @@ def check_lengths(mesh: TetMesh, shape: flat.FlatMesh, dtype: str, seed: int = 0
     np.testing.assert_allclose(found, want, rtol=0, atol=TOLERANCE[dtype])
 
 
+@pytest.mark.optimised
 def test_chords_add_up_to_the_hull(dtype, loops):
     for name in NAMES[loops]:
         shape = flat.MESHES[name]()

@@ -15,6 +15,8 @@ from jaxvr._core.once import once
 from jaxvr.trace import RayCast
 from jaxvr.volume import datasets
 
+pytestmark = pytest.mark.optimised
+
 
 @pytest.mark.parametrize("location", ["point", "corner"])
 def test_no_kernel_of_a_step_is_handed_to_several_threads(location):

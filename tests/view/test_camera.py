@@ -11,6 +11,8 @@ import pytest
 
 from jaxvr.view.camera import Camera
 
+pytestmark = pytest.mark.optimised
+
 
 class Box:
     """Stands in for a volume."""
