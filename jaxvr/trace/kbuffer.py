@@ -96,11 +96,13 @@ Array = jax.Array
 class Held(NamedTuple):
     """A path that leads back, of R rays: word of the face that it has come to, with the cell behind
     it, -1 if none does; the depth that was reached before, a crossing, and the word of that face.
+    void (R,): it is a ring that holds nothing, and the depth is beyond all of it.
     """
 
     word: Array
     at: Crossing
     face: Array
+    void: Array
 
 
 class BufferState(NamedTuple):
@@ -205,7 +207,7 @@ class KBuffer(AbstractTracer):
             outside=no,
             last=integer - 1,
             reach=zero - jnp.inf,
-            held=Held(integer - 1, Crossing(zero, zero, zero), integer),
+            held=Held(integer - 1, Crossing(zero, zero, zero), integer, no),
             ringed=no,
             owed=(integer - 1, zero),
             wrong=wrong,
@@ -321,8 +323,8 @@ def _bits(where: Array, bit: int) -> Array:
 class Chosen(NamedTuple):
     """Two entries of R rays. found (R,): there are two. shared (R,): a cell lies between them. new
     (R,): the first starts a path. follows (R,): it goes on with a path that is held. void (R,): it
-    starts a ring that holds nothing, and the entry of that that is farthest. ring (R,): it starts
-    one that does. ready (K, R): see `buffer.ready_entries`."""
+    starts a ring that holds nothing. ring (R,): it starts one that does. ready (K, R): see
+    `buffer.ready_entries`."""
 
     pair: Pair
     found: Array
@@ -330,7 +332,6 @@ class Chosen(NamedTuple):
     new: Array
     follows: Array
     void: Array
-    farthest: Array
     ring: Array
     ready: Array
 
@@ -342,7 +343,7 @@ def _choose_closest(rays: BeamRays, state: BufferState, give: Array) -> Chosen:
     slack = tolerance(jnp.where(jnp.isfinite(near), near, 0), rays.sheared)
     pair, shared = stage(jnp.any(give), closest_pair, depth, words, state.last, slack)
     no = jnp.zeros_like(give)
-    return Chosen(pair, give & pair.found, shared, no, no, no, pair.first, no, words[0] >= 0)
+    return Chosen(pair, give & pair.found, shared, no, no, no, no, words[0] >= 0)
 
 
 def _choose_by_cells(state: BufferState, give: Array, how: KBuffer) -> Chosen:
@@ -370,7 +371,7 @@ def _choose_by_cells(state: BufferState, give: Array, how: KBuffer) -> Chosen:
     found = give & pair.found
     new = found & (jnp.all(sides >= 0, axis=0) | jnp.any(sides == -1, axis=0))
     ring = odd & choice.ring & ~void
-    return Chosen(pair, found, found, new, follows, void, choice.farthest, ring, ready)
+    return Chosen(pair, found, found, new, follows, void, ring, ready)
 
 
 def _true_depths(depth: Array, how: KBuffer) -> Array:
@@ -379,7 +380,7 @@ def _true_depths(depth: Array, how: KBuffer) -> Array:
 
 
 class Start(NamedTuple):
-    """Where segments of R rays start: at a crossing, that of the face of a word, if they are cut."""
+    """Where segments of R rays start, if cut (R,): at a crossing, that of the face of a word."""
 
     at: Crossing
     word: Array
@@ -402,20 +403,22 @@ def _start(state: BufferState, chosen: Chosen, onward: Array, how: KBuffer) -> S
     way is looked for in the buffer. That takes faces that lie farther than the second entry though
     no path has come to them, or a turned cell, and is rare.
     """
-    buffer, pair = state.buffer, chosen.pair
+    buffer, pair, held = state.buffer, chosen.pair, state.held
+    true = _true_depths(lax.stop_gradient(buffer.depth[0]), how)
+    beyond = jnp.max(jnp.where(jnp.isfinite(true), true, -jnp.inf), axis=0) + 1
+    beyond = jnp.where(chosen.void, beyond, 0)
+    at = choose(chosen.follows, held.at, Crossing(beyond, beyond * 0, beyond * 0))
+    known = Start(at, held.face, chosen.found & (chosen.follows | chosen.void))
     if not how.reverse:
-        far, word = _crossing(buffer, chosen.farthest, how)
-        at = choose(chosen.follows, state.held.at, far)
-        word = jnp.where(chosen.follows, state.held.face, word)
-        return Start(at, word, chosen.found & (chosen.follows | chosen.void))
+        return known
     depth, words = lax.stop_gradient(buffer.depth), buffer.words
     used, size = used_entries(depth[0]), depth.shape[1]
     others = used & ~is_number(pair.first, size) & ~is_number(pair.second, size)
     second = pick(pair.second, depth)[0]
     farther = jnp.any(others & ~chosen.ready & (depth[0] < second[None]), axis=0)
     turned = jnp.any((words >= 0) & (packing.turned_of(words) == 1), axis=(0, 1))
-    doubt = chosen.found & (farther | turned | chosen.follows | chosen.void)
-    true = _true_depths(depth[0], how)
+    void = known.cut & (chosen.void | (chosen.follows & held.void))
+    doubt = chosen.found & (farther | turned | chosen.follows) & ~void
 
     def look(true, words, ready, second, onward, doubt):
         return deepest(follow(true, words, ready, second, onward, doubt, known=True))
@@ -425,7 +428,7 @@ def _start(state: BufferState, chosen: Chosen, onward: Array, how: KBuffer) -> S
     at, word = _crossing(buffer, number, how)
     lead = lax.stop_gradient(at.z) + second
     cut = doubt & (jnp.abs(lead) > ROUNDING * jnp.finfo(lead.dtype).eps)
-    return Start(at, word, cut)
+    return Start(*(choose(void, x, y) for x, y in zip(known, (at, word, cut), strict=True)))
 
 
 def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuffer):
@@ -525,7 +528,8 @@ def _hold(state: BufferState, chosen: Chosen, start: Start, after, faces, onward
         face = jnp.where(start.cut, start.word, faces.enter)
     word = jnp.where(hold, onward, jnp.where(give, -1, state.held.word))
     face = jnp.where(hold, face, state.held.face)
-    return state._replace(held=Held(word, choose(hold, at, state.held.at), face))
+    void = hold & (chosen.void | (chosen.follows & state.held.void))
+    return state._replace(held=Held(word, choose(hold, at, state.held.at), face, void))
 
 
 def _in_order(state: BufferState, chosen: Chosen, faces: Between, between, solid, slack, how):

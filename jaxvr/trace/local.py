@@ -242,7 +242,7 @@ def as_rays(rays: ShearedRays, gradient: Any) -> ShearedRays:
 def segment_from(
     start: Crossing, enter: Crossing, leave: Crossing, cut: Array, turned: Array, stretch: Array
 ) -> tuple[Segment, Reached]:
-    """`make_segment` of a cell between two crossings, from a third one on where it is `cut` (R,)."""
+    """`make_segment` of a cell between two crossings, from a third on where it is `cut` (R,)."""
     start = choose(cut, start, enter)
     lead = jnp.where(cut, (start.z - enter.z) + (start.z_low - enter.z_low), 0)
     reached = Reached(jnp.stack([start.z, start.z_low]), lead)

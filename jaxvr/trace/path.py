@@ -112,13 +112,12 @@ def deepest(path: Path) -> Array:
 
 class Choice(NamedTuple):
     """first (R,): the entry whose turn it is. ring, void (R,): whether it is the first of a ring,
-    and of one without turned cells, which a ray has come no farther in. farthest (R,): the entry of
-    the ring that is."""
+    and of one without turned cells: what such a ring gains on the way there it loses on the way
+    back, and a ray has passed all of it on its path."""
 
     first: Array
     ring: Array
     void: Array
-    farthest: Array
 
 
 def untangle(
@@ -136,4 +135,5 @@ def untangle(
     met, ring = one.met | two.met, one.ring
     closer = pick(one.at, depth) <= pick(two.at, depth)
     start = jnp.where(ring, least, jnp.where(closer, one.at, two.at))
-    return Choice(jnp.where(met, waiting, start), ring & ~met, ring & ~met & ~one.turned, one.low)
+    ring = ring & ~met
+    return Choice(jnp.where(met, waiting, start), ring, ring & ~one.turned)
