@@ -71,8 +71,12 @@ def ready_entries(depth: Array, words: Array) -> Array:
     """Entries (K, R) that a path has come to, or that start one: not more than one cell is left of
     their two, and not that before the boundary that a path ends at."""
     left = words >= 0
-    ends = left & (packing.flag_of(words) == 1)
-    return used_entries(depth[0]) & ~(left[0] & left[1]) & ~jnp.any(ends, axis=0)
+    return used_entries(depth[0]) & ~(left[0] & left[1]) & ~_ends(words)
+
+
+def _ends(words: Array) -> Array:
+    """Entries (K, R) at a boundary that a path ends at."""
+    return jnp.any((words >= 0) & (packing.flag_of(words) == 1), axis=0)
 
 
 def cell_pair(depth: Array, words: Array, first: Array, only: Array) -> Pair:
@@ -81,7 +85,7 @@ def cell_pair(depth: Array, words: Array, first: Array, only: Array) -> Pair:
     rest = used_entries(depth[0]) & ~is_number(first, depth.shape[1])
     # Cells are equal where words are, but for the corner.
     ours, cells = packing.cell_of(pick(first, words)), packing.cell_of(words)
-    ours = jnp.where((only < 0) | (ours == only), ours, -1)
+    ours = jnp.where((only < 0)[None] | (ours == only[None]), ours, -1)
     shared = rest & _know(ours[:, None], cells)
     second = least(depth, shared)
     theirs = pick(second, cells)
@@ -95,20 +99,23 @@ def closest_pair(depth: Array, words: Array, last: Array, slack: Array) -> tuple
     """The closest two entries, and whether (R,) a cell lies between them.
 
     Depths that differ by no more than `slack` (R,) are equal. Among equals the first is the end of
-    the segment before, which has `last` (R,) for its word, and the second is one that has a cell in
-    common with the first: so cells without volume, which make all of their faces equal, are passed
-    in the order in which they lie.
+    the segment before, which has `last` (R,) for its word, or else a boundary that a path starts
+    at; and the second has a cell in common with the first, or is such a boundary. So cells without
+    volume, which make all of their faces equal, are passed in the order in which they lie.
     """
     used = used_entries(depth[0])
-    size = used.shape[0]
+    starts = jnp.any(words == -1, axis=0) & ~_ends(words)
 
     def among(valid: Array, preferred: Array) -> Array:
         closest = jnp.min(jnp.where(valid, depth[0], jnp.inf), axis=0)
-        equal = valid & preferred & (depth[0] <= (closest + slack)[None])
-        return least(depth, jnp.where(jnp.any(equal, axis=0)[None], equal, valid))
+        equal = valid & (depth[0] <= (closest + slack)[None])
+        for some in (starts, preferred):
+            chosen = equal & some
+            valid = jnp.where(jnp.any(chosen, axis=0)[None], chosen, valid)
+        return least(depth, valid)
 
     first = among(used, words[0] == last[None])
-    rest = used & ~is_number(first, size)
+    rest = used & ~is_number(first, used.shape[0])
     ours, cells = packing.cell_of(pick(first, words)), packing.cell_of(words)
     second = among(rest, _know(ours[:, None], cells))
     theirs = pick(second, cells)

@@ -489,7 +489,7 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
         state = state._replace(
             last=jnp.where(found, second.words[0], state.last),
             reach=jnp.where(drop, jnp.maximum(state.reach, reach), state.reach),
-            wrong=state.wrong | _bits(solid & ~chosen.shared, bits.UNPAIRED),
+            wrong=state.wrong | _bits(inside & ~chosen.shared & (end >= 0), bits.UNPAIRED),
         )
     finished = done & (count == 0)
     # A ray may end here, so what is owed now is told; it is taken back if it turns out to be paid.
