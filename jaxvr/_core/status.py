@@ -16,7 +16,7 @@ STEPS = 2
 K_TOO_SMALL = 4
 BROKEN = 8
 UNSORTED = 16
-UNPAIRED = 32
+TANGLED = 32
 LENGTHS = 64
 SCALARS = 128
 
@@ -52,10 +52,10 @@ _MEANING = {  # what explains others first
         "Increase `k` of `KBuffer` (`jaxvr.measure_k` tells how many the view needs), or take the "
         "image as it is with `render(..., status=True)`.",
     ),
-    UNPAIRED: (
-        "met two closest fragments that no cell lies between",
-        "Where cells overlap or are overturned, they are not the ends of a segment. Take `KBuffer` "
-        'with `pairs="cells"`.',
+    TANGLED: (
+        "met fragments that no order by depth puts right",
+        "Cells overlap there or are overturned. Take `RayCast()`; `KBuffer` has trouble with them "
+        'only with `pairs="closest"`, or at an eye inside of several of them.',
     ),
     BROKEN: (
         "met integers that are out of range or do not fit together",

@@ -111,7 +111,8 @@ class BufferState(NamedTuple):
     buffer: the last entry is the place of the fragment that arrives. count (R,): entries in use.
     outside (R,): the paper's tag of a pixel; last (R,): word of the last segment's farther end.
     reach (R,): depth before which nothing may arrive any more, or no path start. held: what path
-    is followed first. ringed (R,): whether the ray met a ring. owed: a cell (R,) that lacks a
+    is followed first. ringed (R,): whether the ray met a ring. seen_from (R,): whether a path leads
+    past the eye, and whether another starts that may. owed: a cell (R,) that lacks a
     fragment, -1 if none does, and the depth (R,) of its other. wrong (R,): bits of status that
     stay; the status has what is owed at the time, too. faces: of the segment. begun (R,): had one.
     """
@@ -124,6 +125,7 @@ class BufferState(NamedTuple):
     reach: Array
     held: Held
     ringed: Array
+    seen_from: tuple[Array, Array]
     owed: tuple[Array, Array]
     wrong: Array
     faces: Between
@@ -209,6 +211,7 @@ class KBuffer(AbstractTracer):
             reach=zero - jnp.inf,
             held=Held(integer - 1, Crossing(zero, zero, zero), integer, no),
             ringed=no,
+            seen_from=(no, no),
             owed=(integer - 1, zero),
             wrong=wrong,
             faces=Between(integer, integer, integer, no, no),
@@ -322,14 +325,15 @@ def _bits(where: Array, bit: int) -> Array:
 
 class Chosen(NamedTuple):
     """Two entries of R rays. found (R,): there are two. shared (R,): a cell lies between them. new
-    (R,): the first starts a path. follows (R,): it goes on with a path that is held. void (R,): it
-    starts a ring that holds nothing. ring (R,): it starts one that does. ready (K, R): see
-    `buffer.ready_entries`."""
+    (R,): the first starts a path; loose (R,): inside of the mesh. follows (R,): it goes on with a
+    path that is held. void (R,): it starts a ring that holds nothing. ring (R,): it starts one that
+    does. ready (K, R): see `buffer.ready_entries`."""
 
     pair: Pair
     found: Array
     shared: Array
     new: Array
+    loose: Array
     follows: Array
     void: Array
     ring: Array
@@ -343,7 +347,7 @@ def _choose_closest(rays: BeamRays, state: BufferState, give: Array) -> Chosen:
     slack = tolerance(jnp.where(jnp.isfinite(near), near, 0), rays.sheared)
     pair, shared = stage(jnp.any(give), closest_pair, depth, words, state.last, slack)
     no = jnp.zeros_like(give)
-    return Chosen(pair, give & pair.found, shared, no, no, no, no, words[0] >= 0)
+    return Chosen(pair, give & pair.found, shared, no, no, no, no, no, words[0] >= 0)
 
 
 def _choose_by_cells(state: BufferState, give: Array, how: KBuffer) -> Chosen:
@@ -371,7 +375,8 @@ def _choose_by_cells(state: BufferState, give: Array, how: KBuffer) -> Chosen:
     found = give & pair.found
     new = found & (jnp.all(sides >= 0, axis=0) | jnp.any(sides == -1, axis=0))
     ring = odd & choice.ring & ~void
-    return Chosen(pair, found, found, new, follows, void, ring, ready)
+    loose = found & jnp.all(sides >= 0, axis=0) & ~choice.ring
+    return Chosen(pair, found, found, new, loose, follows, void, ring, ready)
 
 
 def _true_depths(depth: Array, how: KBuffer) -> Array:
@@ -489,7 +494,7 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
         state = state._replace(
             last=jnp.where(found, second.words[0], state.last),
             reach=jnp.where(drop, jnp.maximum(state.reach, reach), state.reach),
-            wrong=state.wrong | _bits(inside & ~chosen.shared & (end >= 0), bits.UNPAIRED),
+            wrong=state.wrong | _bits(inside & ~chosen.shared & (end >= 0), bits.TANGLED),
         )
     finished = done & (count == 0)
     # A ray may end here, so what is owed now is told; it is taken back if it turns out to be paid.
@@ -541,6 +546,12 @@ def _in_order(state: BufferState, chosen: Chosen, faces: Between, between, solid
     begin, end = between
     near = jnp.minimum(-begin, -end) if how.reverse else jnp.minimum(begin, end)
     wrong = solid & chosen.new & (near < state.reach - slack)
+    # Faces behind the eye are drawn only of cells that may be round it. If several paths lead past
+    # it, they may be parts of one, and nothing tells which is first.
+    crossed, another = state.seen_from
+    crosses = chosen.found & ((begin < 0) != (end < 0))
+    another = another | (chosen.loose & (crossed | how.reverse))
+    tangled = crosses & another & crossed
     if how.reverse:
         known = jnp.where(chosen.follows, lax.stop_gradient(state.held.at.z), end)
         more = jnp.where(faces.turned, known - begin, begin - known)
@@ -548,7 +559,8 @@ def _in_order(state: BufferState, chosen: Chosen, faces: Between, between, solid
         wrong = wrong | (goes_on & (more > slack))
     return state._replace(
         reach=jnp.where(solid, near, state.reach),
-        wrong=state.wrong | _bits(wrong, bits.K_TOO_SMALL),
+        seen_from=(crossed | crosses, another),
+        wrong=state.wrong | _bits(wrong, bits.K_TOO_SMALL) | _bits(tangled, bits.TANGLED),
     )
 
 

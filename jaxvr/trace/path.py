@@ -71,7 +71,8 @@ def follow(
         if known:
             alive = alive & (path.depths[0] < path.depths[1])
         cell, cells = packing.cell_of(path.word), packing.cell_of(words)
-        other = used & ~is_number(path.at, used.shape[0]) & jnp.any(cells == cell[None, None], axis=0)
+        other = used & ~is_number(path.at, used.shape[0])
+        other = other & jnp.any(cells == cell[None, None], axis=0)
         alive = alive & jnp.any(other, axis=0)
         following = jnp.argmax(other, axis=0).astype(jnp.int32)
         mine = pick(following, words)
