@@ -16,6 +16,17 @@ is between its two fragments (`pairs="cells"`, the default). A cell belongs to e
 neighbours in a sorted list, so that the two ways agree where the paper's is right; by cells it is
 right too where boundaries touch and roundings decide who is first, where the mesh overlaps itself,
 and where a cell is inverted. And it is known whether every cell that a ray crossed got its segment.
+The paper's way tells (`TANGLED`) where no cell lies between the closest two.
+
+Flat and overturned cells. Depths are not those of a walk where moved points or rounding turned
+cells over: a ray comes to a face, goes back to a nearer one, and on from there. `RayCast` waits at
+the depth that it has reached (`local.make_segment`), and so do rays here. By cells fragments form
+paths (`trace.path`), whose direction is known from the boundary on. A fragment that no path has
+come to yet waits in the buffer, whatever its depth; the end of a path that leads back is followed
+first, until it is as far again, and the segment there starts in the depth reached. From behind,
+that depth is looked for in the buffer, among the faces in front. So paths give the segments of
+`RayCast`, and only where several overlap their order is that of depths. Rings of overturned cells
+hold nothing. All that waits takes entries: such views need a larger k.
 
 What a k that is too small does. A fragment whose partner has not arrived leaves the buffer without
 one, and the segment is missing. That is seen, and sets the status `K_TOO_SMALL` of the ray, as does
@@ -149,9 +160,11 @@ class KBuffer(AbstractTracer):
     pairs: "cells" or "closest", which two fragments make a segment; "closest" is the paper's.
     reverse: the farthest segments first; an `Over` that composites back to front sets it.
 
-    Equal to `RayCast` where k suffices, gradients too. Where a mesh overlaps itself, segments come
-    by the depth of their nearer ends, while `RayCast` takes whole paths; the rings of cells that it
-    misses there are found here.
+    Equal to `RayCast` where k suffices, gradients too, also where cells have no volume or moved
+    points have turned some over. Where a mesh overlaps itself, segments of several paths come by
+    the depth of their nearer ends, while `RayCast` takes whole paths; the rings of folded cells
+    that it misses there are found here. With pairs="closest", rays that meet overturned cells have
+    the status `TANGLED`, and so have those from an eye inside of several cells at once.
 
     Rays that share an origin (pinhole) or a direction (orthographic) with their batch are fast. Any
     others are tested against every face, in an order that suits them only roughly.
@@ -529,7 +542,7 @@ def _hold(state: BufferState, chosen: Chosen, start: Start, after, faces, onward
         hold, at, face = there & start.cut, start.at, start.word
     else:
         hold = there & (after.lead != 0)
-        at = Crossing(*after.depth, jnp.zeros_like(after.lead))
+        at = Crossing(after.depth[0], after.depth[1], jnp.zeros_like(after.lead))
         face = jnp.where(start.cut, start.word, faces.enter)
     word = jnp.where(hold, onward, jnp.where(give, -1, state.held.word))
     face = jnp.where(hold, face, state.held.face)

@@ -5,6 +5,7 @@ compiled."""
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import flat_meshes as flat
 import jax
@@ -88,12 +89,15 @@ def transfer_of(dtype: str):
     return jaxvr.TransferFunction(*TRANSFER, dtype=dtype)
 
 
-def compared(mesh, dtype, direction="front to back", rays=None, **how):
+def compared(mesh, dtype, direction: Any = "front to back", **how):
     """The largest difference of each ray from ray casting, and its status."""
-    rays, tf = rays or rays_of(dtype), transfer_of(dtype)
-    exact = jaxvr.render_rays(mesh, *rays, tf)
+    (origins, directions), tf = rays_of(dtype), transfer_of(dtype)
+    exact = jaxvr.render_rays(mesh, origins, directions, tf)
     found, status = jaxvr.render_rays(
-        *(mesh, *rays, tf),
+        mesh,
+        origins,
+        directions,
+        tf,
         tracer=jaxvr.KBuffer(**how),
         compositor=jaxvr.Over(direction=direction),
         status=True,
