@@ -16,6 +16,7 @@ STEPS = 2
 K_TOO_SMALL = 4
 BROKEN = 8
 UNSORTED = 16
+TANGLED = 32
 LENGTHS = 64
 SCALARS = 128
 
@@ -50,6 +51,11 @@ _MEANING = {  # what explains others first
         "needed a k-buffer with more entries",
         "Increase `k` of `KBuffer` (`jaxvr.measure_k` tells how many the view needs), or take the "
         "image as it is with `render(..., status=True)`.",
+    ),
+    TANGLED: (
+        "met fragments that no order by depth puts right",
+        "Cells overlap there or are overturned. Take `RayCast()`; `KBuffer` has trouble with them "
+        'only with `pairs="closest"`, or at an eye inside of several of them.',
     ),
     BROKEN: (
         "met integers that are out of range or do not fit together",

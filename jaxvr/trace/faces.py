@@ -2,7 +2,7 @@
 
 Slot 4 c + k is the face of cell c opposite its local vertex k. A face between two cells belongs to
 the cell of the lower number; the other's slot is empty. So nothing is stored that the mesh does not
-have, and boxes round blocks of cells are all that is computed beforehand.
+have, and boxes round blocks of cells and a byte a cell are all that is computed beforehand.
 """
 
 from __future__ import annotations
@@ -24,10 +24,13 @@ CELLS = BLOCK // 4
 
 @pytree
 class CellFaces:
-    """A `FaceSource` over a scene. boxes: low and high corners (3, blocks)."""
+    """A `FaceSource` over a scene. boxes: low and high corners (3, blocks). marks (T,) int8: bit 0
+    if the cell is `turned` (see `packing`), and bit 1, of cells at the boundary, tau (see
+    `TetMesh.boundary`)."""
 
     scene: Scene
     boxes: tuple[Array, Array]
+    marks: Array
 
     @property
     def vertices(self) -> Array:
@@ -66,6 +69,15 @@ class CellFaces:
 
         return lax.cond(near, inside, lambda slot: jnp.zeros(slot.shape, bool), slot)
 
+    def turned(self, cell: Array) -> Array:
+        """`turned` (N,) of cells, as an int32."""
+        return take(self.marks, cell).astype(jnp.int32) & 1
+
+    def inwards(self, slot: Array) -> Array:
+        """The flag `entry` of `TetMesh.boundary` for slots (N,) at the boundary."""
+        tau = (take(self.marks, slot // 4) & 2) != 0
+        return tau == (slot % 2 == 1)
+
     def _round(self, origin: Array, cell: Array) -> Array:
         """Whether the boxes of cells (N,) contain a point (3,)."""
         ids = take(self.scene.cells, 4 * cell[None] + jnp.arange(4, dtype=jnp.int32)[:, None])
@@ -81,4 +93,18 @@ def cell_faces(scene: Scene) -> CellFaces:
     ids = take(scene.cells.reshape(-1, 4), number)
     count = scene.coordinates.shape[0] // 3
     points = lax.stop_gradient(scene.coordinates).reshape(3, count)[:, ids.reshape(blocks, -1)]
-    return CellFaces(scene, (points.min(2), points.max(2)))
+    return CellFaces(scene, (points.min(2), points.max(2)), _marks(scene))
+
+
+def _marks(scene: Scene) -> Array:
+    words = scene.neighbors.reshape(-1, 4)
+    # A neighbour's word for the way back says how this cell lies.
+    side = jnp.argmax(words >= 0, axis=1)
+    word = jnp.take_along_axis(words, side[:, None], axis=1)[:, 0]
+    back = scene.neighbors.at[4 * packing.cell_of(word) + packing.corner_of(word)].get(mode="clip")
+    turned = jnp.where(word >= 0, packing.turned_of(back), 0).astype(jnp.int8)
+    face = scene.faces
+    cell = jnp.where(face >= 0, packing.cell_of(face), words.shape[0])
+    tau = packing.flag_of(face) == packing.corner_of(face) % 2
+    mark = packing.turned_of(face) | jnp.where(tau, 2, 0)
+    return turned.at[cell].set(mark.astype(jnp.int8), mode="drop")

@@ -101,7 +101,7 @@ def in_order(three: Any, place: Array) -> Any:
 
 # Depths of the scene, whose coordinates are below 1, that are this close may differ by rounding: a
 # few units in the last place of coordinates.
-_ROUNDING = 16
+ROUNDING = 16
 
 
 @jax.custom_jvp
@@ -142,7 +142,7 @@ def make_segment(reached: Reached, front: Array, out: Crossing, turned: Array, s
     advance = (out.z - depth[0]) + (out.z_low - depth[1])
     ahead = jnp.where(turned, -advance, advance)
     proper = ahead > 0
-    near = ahead > -_ROUNDING * jnp.finfo(ahead.dtype).eps
+    near = ahead > -ROUNDING * jnp.finfo(ahead.dtype).eps
     exit_depth = jnp.stack([out.z, out.z_low])
     end = _moving_as(jnp.where(proper[None], exit_depth, depth), exit_depth)
     end = jnp.where(near[None], end, depth)
@@ -239,11 +239,14 @@ def as_rays(rays: ShearedRays, gradient: Any) -> ShearedRays:
     return dataclasses.replace(out, **dict(zip(names, gradient, strict=True)))
 
 
-def segment_between(near: Crossing, far: Crossing, stretch: Array) -> Segment:
-    """The segment between two crossings, of which `far` is not the nearer one."""
-    reached = Reached(jnp.stack([near.z, near.z_low]), jnp.zeros_like(near.z))
-    no = jnp.zeros(stretch.shape, bool)
-    return make_segment(reached, near.value, far, no, stretch)[0]
+def segment_from(
+    start: Crossing, enter: Crossing, leave: Crossing, cut: Array, turned: Array, stretch: Array
+) -> tuple[Segment, Reached]:
+    """`make_segment` of a cell between two crossings, from a third on where it is `cut` (R,)."""
+    start = choose(cut, start, enter)
+    lead = jnp.where(cut, (start.z - enter.z) + (start.z_low - enter.z_low), 0)
+    reached = Reached(jnp.stack([start.z, start.z_low]), lead)
+    return make_segment(reached, enter.value, leave, turned, stretch)
 
 
 def pull_back_cell(
@@ -265,10 +268,7 @@ def pull_back_cell(
 
     def pull_back_segment(enter, start, leave, stretch, bar):
         def forward(enter, start, leave, stretch):
-            start = choose(cut, start, enter)
-            lead = jnp.where(cut, (start.z - enter.z) + (start.z_low - enter.z_low), 0)
-            reached = Reached(jnp.stack([start.z, start.z_low]), lead)
-            return make_segment(reached, enter.value, leave, turned, stretch)[0]
+            return segment_from(start, enter, leave, cut, turned, stretch)[0]
 
         return jax.vjp(forward, enter, start, leave, stretch)[1](bar)
 
@@ -344,10 +344,22 @@ def _to_rays(by_rays: Any, rays: ShearedRays, first: Any, second: Any, stretch_b
     return tuple(g + c for g, c in zip(by_rays, change, strict=True))
 
 
+class Between(NamedTuple):
+    """The faces of a segment, as words of cell and corner (R,): enter and leave, in the order of
+    the path; start, where it is cut (R,), that in whose depth it starts; turned (R,): whether the
+    path leads back from one to the other."""
+
+    enter: Array
+    leave: Array
+    start: Array
+    cut: Array
+    turned: Array
+
+
 def pull_back_pair(
     scene: Scene,
     rays: ShearedRays,
-    words: tuple[Array, Array],
+    faces: Between,
     live: Array,
     cotangent: Segment,
     gradient: Any,
@@ -355,23 +367,30 @@ def pull_back_pair(
     """The same for segments between any two faces.
 
     Args:
-      words: packed cell and corner (R,) of the face at the nearer and at the farther end.
-      live (R,): rays that have a segment. cotangent: of `segment_between`.
+      faces: what the segments are between. live (R,): rays that have one.
+      cotangent: of `segment_from`.
     """
     (values, coordinates), by_rays = gradient
     wanted = jnp.any(live)
+    words = (faces.enter, faces.leave)
     ends = [_end(scene, rays, jnp.where(live, word, 0), wanted) for word in words]
+    cut = live & faces.cut
+    before = jnp.where(cut, faces.start, 0)
+    start = once(jnp.any(cut), _start_at, ends[0].at, scene, rays, before, cut)
 
-    def pull_back_segment(near: Crossing, far: Crossing, stretch: Array, bar: Segment):
-        return jax.vjp(segment_between, near, far, stretch)[1](bar)
+    def pull_back_segment(enter, start, leave, stretch, bar):
+        def forward(enter, start, leave, stretch):
+            return segment_from(start, enter, leave, cut, faces.turned, stretch)[0]
+
+        return jax.vjp(forward, enter, start, leave, stretch)[1](bar)
 
     cotangent = Segment(*(jnp.where(live, g, 0) for g in cotangent))
-    near_bar, far_bar, stretch_bar = stage(
-        wanted, pull_back_segment, ends[0].at, ends[1].at, rays.stretch, cotangent
+    enter_bar, start_bar, leave_bar, stretch_bar = stage(
+        wanted, pull_back_segment, ends[0].at, start, ends[1].at, rays.stretch, cotangent
     )
     pulled = [
         stage(wanted, _pull_back_crossing, end.face, end.area, bar.z, bar.value)
-        for end, bar in zip(ends, (near_bar, far_bar), strict=True)
+        for end, bar in zip(ends, (enter_bar, leave_bar), strict=True)
     ]
     for end, q in zip(ends, pulled, strict=True):
         if values is not None:
@@ -381,8 +400,11 @@ def pull_back_pair(
             none = _Pulled(*(jnp.zeros_like(x) for x in q))
             shares = [(share, jnp.zeros_like(share)) for share in end.share]
             coordinates = _to_points(coordinates, rays, end.ids, shares, q, none)
-    near, far = zip(pulled, (end.at for end in ends), strict=True)
-    return (values, coordinates), _to_rays(by_rays, rays, near, far, stretch_bar)
+    first, second = zip(pulled, (end.at for end in ends), strict=True)
+    by_rays = _to_rays(by_rays, rays, first, second, stretch_bar)
+    moved = (coordinates, by_rays)
+    moved = once(jnp.any(cut), _pull_back_start, moved, scene, rays, before, cut, start_bar.z)
+    return (values, moved[0]), moved[1]
 
 
 class _End(NamedTuple):

@@ -81,8 +81,10 @@ def measure_k(
       a `KMap`. An image with `KBuffer(k=map.k, order=order)` is right everywhere.
 
     Where a mesh is folded or overlaps itself, a fragment may have to stay for a second segment, and
-    an entry more may be needed: the status of the image has the last word. So it has with
-    `pairs="closest"` and an eye among cells: that way needs what is behind the eye in order, too.
+    an entry more may be needed; where moved points have turned cells over, fragments wait until
+    their path comes to them, and several more may be: the status of the image has the last word. So
+    it has with `pairs="closest"` and an eye among cells: that way needs what is behind the eye in
+    order, too.
 
     Fragments at the same depth to rounding (a ray through an edge) count as out of order, whichever
     comes first. Not for use inside `jit`: how much there is to remember is only known afterwards.

@@ -76,12 +76,13 @@ class Stream(NamedTuple):
 
 class Hits(NamedTuple):
     """A fragment of each ray, or none: hit (R,), whether it met a face; slot (R,) of that; face and
-    weights (3, R) as in `trace.raycast.Ahead`; at: depth and scalar."""
+    weights (3, R) and positive (R,) as in `trace.raycast.Ahead`; at: depth and scalar."""
 
     hit: Array
     slot: Array
     face: Face
     weights: Array
+    positive: Array
     at: Crossing
 
 
@@ -163,7 +164,7 @@ def next_fragments(
     a, b, c = (is_positive(edge) for edge in edges)
     weights = sizes_of(edges)
     at = stage(wanted, crossing, face, weights, rays.eye)
-    return stream, Hits(go & (a == b) & (b == c), slot, face, weights, at)
+    return stream, Hits(go & (a == b) & (b == c), slot, face, weights, a, at)
 
 
 def draw(source: FaceSource, rays: BeamRays, sort: Sort, carry: Any, add: Any) -> Any:
