@@ -63,11 +63,11 @@ def colors(mesh, origins, directions):
     values = np.asarray(mesh.values, np.float64)
     size = float(np.linalg.norm(np.ptp(np.asarray(mesh.points, np.float64), axis=0)))
     at = np.linspace(values.min(), values.max(), 3)
-    tf = jaxvr.TransferFunction(
-        *(np.asarray(x, mesh.dtype) for x in (at, np.eye(3), [1 / size] * 3))
-    )
-    rays = (np.asarray(x, mesh.dtype) for x in (origins, directions))
-    rgba, status = jaxvr.render_rays(mesh, *rays, tf, status=True)
+    arrays = np.linspace(values.min(), values.max(), 3), np.eye(3), np.full(3, 1 / size)
+    at, light, extinctions = (x.astype(mesh.dtype) for x in arrays)
+    tf = jaxvr.TransferFunction(at, light, extinctions)
+    origins, directions = (np.asarray(x, mesh.dtype) for x in (origins, directions))
+    rgba, status = jaxvr.render_rays(mesh, origins, directions, tf, status=True)
     assert not np.asarray(status).any()
     return np.asarray(rgba)
 
@@ -81,7 +81,11 @@ def rays_through(points, count=64):
     return target - 3 * away, away
 
 
-@pytest.mark.parametrize("name", MESHES)
+FLAT = ("lattice", "squashed", "all flat at the boundary")
+CASES = [(name, "float64") for name in MESHES] + [(name, "float32") for name in FLAT]
+
+
+@pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_a_mirrored_mesh_has_the_mirrored_picture(name, dtype):
     mesh = MESHES[name](dtype)
     points = np.asarray(mesh.points)
@@ -121,7 +125,9 @@ def test_a_fold_is_told_with_its_cells():
     mesh = datasets.box((4, 2, 2))
     points = np.array(mesh.points)
     points[:, 0] = np.abs(points[:, 0] - 0.5)  # the half to the left over the one to the right
-    before, after = (signed_volumes(p, np.asarray(mesh.cells))[1] for p in (mesh.points, points))
+    before, after = (
+        signed_volumes(p, np.asarray(mesh.cells))[1] for p in (np.asarray(mesh.points), points)
+    )
     over = int((before != after).sum())
     assert over == mesh.n_tets // 2
     with pytest.warns(UserWarning, match=f"turn {over} of {mesh.n_tets} tetrahedra over") as caught:
