@@ -125,8 +125,6 @@ def rays_at_features(mesh: FlatMesh, count: int, seed: int = 0) -> tuple[np.ndar
     a half along directions of the lattice, the others from anywhere. None of them lies in a plane
     of the hull, where it is a matter of taste what it sees: those are moved a little inwards."""
     rng = np.random.default_rng(seed)
-    low, high = mesh.points.min(0), mesh.points.max(0)
-    middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     corners = mesh.points[mesh.cells[rng.integers(0, len(mesh.cells), count)]]
     used = 1 + np.arange(count) % 4
     weight = (np.arange(4) < used[:, None]) / used[:, None]
@@ -135,9 +133,44 @@ def rays_at_features(mesh: FlatMesh, count: int, seed: int = 0) -> tuple[np.ndar
     along[(along == 0).all(1)] = [1, 0, 0]
     free = rng.normal(size=(count, 3))
     direction = np.where((np.arange(count) // 4 % 2 == 0)[:, None], along, free)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return _from_outside(mesh, target, direction)
+
+
+def rays_along_features(mesh: FlatMesh, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Rays (R, 3) along edges of cells, in planes of their faces, from one vertex to another, and
+    through vertices in planes of the axes, by turns; hull planes as in `rays_at_features`."""
+    rng = np.random.default_rng(seed)
+    a, b, c, _ = mesh.points[mesh.cells[rng.integers(0, len(mesh.cells), count)]].swapaxes(0, 1)
+    other = mesh.points[mesh.cells[rng.integers(0, len(mesh.cells), count), 0]]
+    u, v = rng.uniform(0.1, 0.9, (2, count, 1))
+    span = np.ptp(mesh.points, axis=0)
+    plane = rng.normal(size=(count, 3)) * span * (rng.integers(0, 3, (count, 1)) != np.arange(3))
+    kind = np.arange(count) % 4
+    target = np.select(
+        [kind[:, None] == k for k in range(3)],
+        [a + u * (b - a), (1 - u) * a + u * ((1 - v) * b + v * c), a],
+        a,
+    )
+    direction = np.select(
+        [kind[:, None] == k for k in range(3)],
+        [b - a, (b - a) * rng.normal(size=(count, 1)) + (c - a), other - a],
+        plane,
+    )
+    direction[(direction == 0).all(1)] = [1, 0, 0]
+    return _from_outside(mesh, target, direction)
+
+
+def _from_outside(
+    mesh: FlatMesh, target: np.ndarray, direction: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    low, high = mesh.points.min(0), mesh.points.max(0)
+    middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     normals, offsets = hull_planes(mesh.points)
-    room = np.abs(offsets - target @ normals.T) / size
-    grazes = ((np.abs(direction @ normals.T) < 1e-3) & (room < 1e-3)).any(1)
+    grazes = np.zeros(len(target), bool)
+    for i in range(0, len(target), 1 << 16):
+        part = slice(i, i + (1 << 16))
+        room = np.abs(offsets - target[part] @ normals.T) / size
+        grazes[part] = ((np.abs(direction[part] @ normals.T) < 1e-3) & (room < 1e-3)).any(1)
     target = np.where(grazes[:, None], target + 0.01 * (middle - target), target)
     return target - 2 * size * direction, direction

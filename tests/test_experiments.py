@@ -18,6 +18,7 @@ from experiments import (
     control_points,
     demo,
     fit_transfer,
+    flat_cells,
     full_vs_partial,
     integrators,
     k_requirements,
@@ -194,12 +195,30 @@ def kbuffer_refine_change(folder: Path) -> float:
     return max(row["change"] for row in rows)
 
 
+def flat_cells_error(folder: Path) -> float:
+    """The worst chord of rays at features of a lattice, as it is and moved; none is lost."""
+    file = folder.with_suffix(".json")
+    names = ["lattice", flat_cells.MOVED]
+    given = ["--tiny", "--dtypes", "float32", "--meshes", *names, "--json", str(file)]
+    report = flat_cells.main(given)["after"]
+    assert json.loads(file.read_text())["after"] == report
+    assert [row["mesh"] for row in report["rows"]] == names
+    for row in report["rows"]:
+        assert row["status"] == row["chord"]["off 1e-4"] == row["picture"]["off 1e-4"] == 0
+    as_is, moved = report["gradients"]
+    assert as_is["pairs"] > 4 and moved["sides differ"] == 0
+    for slopes in (as_is, moved):
+        assert slopes["equal"] == slopes["sides agree"] > 0
+    return max(row["chord"]["worst"] for row in report["rows"])
+
+
 def beside_vtk_error(folder: Path) -> float:
     return beside_vtk.main(["--tiny", "--out", str(folder)])["rows"][0]["max"]
 
 
 EXPERIMENTS = [
     (beside_vtk_error, 0, 0.1),
+    (flat_cells_error, 1e-9, 1e-6),
     (k_requirements_entries, 1, 10),
     (kbuffer_exact_error, 1e-10, 1e-5),
     (kbuffer_speed_rate, 0.1, 10),

@@ -32,15 +32,16 @@ def build(mesh: flat.FlatMesh, dtype: str = "float64", field=None) -> TetMesh:
 
 def check_lengths(mesh: TetMesh, shape: flat.FlatMesh, dtype: str, seed: int = 0) -> None:
     """Sums of chords by features of a mesh against the chord of the hull, which it fills."""
-    origins, directions = (x.astype(dtype) for x in flat.rays_at_features(shape, RAYS, seed=seed))
     tf = jaxvr.TransferFunction(
         jnp.zeros(1, dtype), jnp.ones((1, 3), dtype), jnp.full(1, 0.5, dtype)
     )
-    rgba = np.asarray(jaxvr.render_rays(mesh, origins, directions, tf), np.float64)
-    found = -np.log1p(-rgba[:, 3]) / 0.5
     planes = flat.hull_planes(np.asarray(shape.points, dtype).astype(np.float64))
-    want = flat.hull_chords(planes, origins, directions)
-    np.testing.assert_allclose(found, want, rtol=0, atol=TOLERANCE[dtype])
+    for aim in (flat.rays_at_features, flat.rays_along_features):
+        origins, directions = (x.astype(dtype) for x in aim(shape, RAYS, seed=seed))
+        rgba = np.asarray(jaxvr.render_rays(mesh, origins, directions, tf), np.float64)
+        found = -np.log1p(-rgba[:, 3]) / 0.5
+        want = flat.hull_chords(planes, origins, directions)
+        np.testing.assert_allclose(found, want, rtol=0, atol=TOLERANCE[dtype])
 
 
 @pytest.mark.optimised
