@@ -263,6 +263,7 @@ def check(name: str, shape: flat.FlatMesh, points: np.ndarray, count: int, dtype
     row = {
         "mesh": name,
         "dtype": dtype,
+        "rays": count,
         "cells": mesh.n_tets,
         "flat": getattr(report, "flat", 0),
         "dropped": report.degenerate + getattr(report, "crowded", 0),
@@ -392,7 +393,7 @@ def run(count: int, names: Any = None, dtypes: Any = DTYPES, tiny: bool = False)
             )
         slopes.append(gradients(name, shape, points, *((4, 4) if tiny else (48, 24))))
         print(slopes[-1], flush=True)
-    return {"rays": count, "rows": rows, "gradients": slopes}
+    return {"rows": rows, "gradients": slopes}
 
 
 def seconds(size: int, repeat: int) -> dict[str, Any]:
