@@ -71,10 +71,10 @@ def ready_entries(depth: Array, words: Array) -> Array:
     """Entries (K, R) that a path has come to, or that start one: not more than one cell is left of
     their two, and not that before the boundary that a path ends at."""
     left = words >= 0
-    return used_entries(depth[0]) & ~(left[0] & left[1]) & ~_ends(words)
+    return used_entries(depth[0]) & ~(left[0] & left[1]) & ~path_ends(words)
 
 
-def _ends(words: Array) -> Array:
+def path_ends(words: Array) -> Array:
     """Entries (K, R) at a boundary that a path ends at."""
     return jnp.any((words >= 0) & (packing.flag_of(words) == 1), axis=0)
 
@@ -104,7 +104,7 @@ def closest_pair(depth: Array, words: Array, last: Array, slack: Array) -> tuple
     volume, which make all of their faces equal, are passed in the order in which they lie.
     """
     used = used_entries(depth[0])
-    starts = jnp.any(words == -1, axis=0) & ~_ends(words)
+    starts = jnp.any(words == -1, axis=0) & ~path_ends(words)
 
     def among(valid: Array, preferred: Array) -> Array:
         closest = jnp.min(jnp.where(valid, depth[0], jnp.inf), axis=0)

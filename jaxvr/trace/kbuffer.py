@@ -340,7 +340,7 @@ class Chosen(NamedTuple):
     """Two entries of R rays. found (R,): there are two. shared (R,): a cell lies between them. new
     (R,): the first starts a path; loose (R,): inside of the mesh. follows (R,): it goes on with a
     path that is held. void (R,): it starts a ring that holds nothing. ring (R,): it starts one that
-    does. ready (K, R): see `buffer.ready_entries`."""
+    does. late (R,): see `path.Choice`. ready (K, R): see `buffer.ready_entries`."""
 
     pair: Pair
     found: Array
@@ -350,6 +350,7 @@ class Chosen(NamedTuple):
     follows: Array
     void: Array
     ring: Array
+    late: Array
     ready: Array
 
 
@@ -360,7 +361,7 @@ def _choose_closest(rays: BeamRays, state: BufferState, give: Array) -> Chosen:
     slack = tolerance(jnp.where(jnp.isfinite(near), near, 0), rays.sheared)
     pair, shared = stage(jnp.any(give), closest_pair, depth, words, state.last, slack)
     no = jnp.zeros_like(give)
-    return Chosen(pair, give & pair.found, shared, no, no, no, no, no, words[0] >= 0)
+    return Chosen(pair, give & pair.found, shared, no, no, no, no, no, no, words[0] >= 0)
 
 
 def _choose_by_cells(state: BufferState, give: Array, how: KBuffer) -> Chosen:
@@ -389,7 +390,9 @@ def _choose_by_cells(state: BufferState, give: Array, how: KBuffer) -> Chosen:
     new = found & (jnp.all(sides >= 0, axis=0) | jnp.any(sides == -1, axis=0))
     ring = odd & choice.ring & ~void
     loose = found & jnp.all(sides >= 0, axis=0) & ~choice.ring
-    return Chosen(pair, found, found, new, loose, follows, void, ring, ready)
+    return Chosen(
+        pair, found, found, new, loose, follows, void, ring, found & odd & choice.late, ready
+    )
 
 
 def _true_depths(depth: Array, how: KBuffer) -> Array:
@@ -558,7 +561,7 @@ def _in_order(state: BufferState, chosen: Chosen, faces: Between, between, solid
     """
     begin, end = between
     near = jnp.minimum(-begin, -end) if how.reverse else jnp.minimum(begin, end)
-    wrong = solid & chosen.new & (near < state.reach - slack)
+    wrong = chosen.late | (solid & chosen.new & (near < state.reach - slack))
     # Faces behind the eye are drawn only of cells that may be round it. If several paths lead past
     # it, they may be parts of one, and nothing tells which is first.
     crossed, another = state.seen_from

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxvr.trace.buffer import is_number, pick, used_entries
+from jaxvr.trace.buffer import is_number, path_ends, pick, used_entries
 from jaxvr.volume import packing
 
 Array = jax.Array
@@ -114,11 +114,13 @@ def deepest(path: Path) -> Array:
 class Choice(NamedTuple):
     """first (R,): the entry whose turn it is. ring, void (R,): whether it is the first of a ring,
     and of one without turned cells: what such a ring gains on the way there it loses on the way
-    back, and a ray has passed all of it on its path."""
+    back, and a ray has passed all of it on its path. late (R,): whether it is the boundary that a
+    path ends at, though where that comes from is not in the buffer."""
 
     first: Array
     ring: Array
     void: Array
+    late: Array
 
 
 def untangle(
@@ -137,4 +139,7 @@ def untangle(
     closer = pick(one.at, depth) <= pick(two.at, depth)
     start = jnp.where(ring, least, jnp.where(closer, one.at, two.at))
     ring = ring & ~met
-    return Choice(jnp.where(met, waiting, start), ring, ring & ~one.turned)
+    far_end = pick(jnp.where(closer, two.at, one.at), words)
+    comes_last = pick(start, path_ends(words).astype(jnp.int32)) == 1
+    late = comes_last & ~jnp.any(far_end == -1, axis=0) & ~met & ~ring
+    return Choice(jnp.where(met, waiting, start), ring, ring & ~one.turned, late)

@@ -19,7 +19,7 @@ from jaxvr.volume import TetMesh
 
 pytestmark = pytest.mark.usefixtures("quick_code")
 
-ENOUGH = 48
+ENOUGH = 80
 TOLERANCE = {"float64": 1e-11, "float32": 2e-5}
 TRANSFER = ([0, 0.37, 1.3], [[0, 0, 1.0], [0, 1, 0], [1, 0, 0]], [0.5, 2.0, 4.0])
 SMALL = {
