@@ -9,8 +9,7 @@ JAX's own, from a pinhole and with parallel rays, by `render` and by `shade`. Th
 weighted sum by values, points, positions, colours, extinctions, eye and target are compared too,
 each times its own power of two. Told is the range of exponents without a gap where all bits are the
 same, and what pictures outside of it are: an error in words, a gradient that is NaN by what is out
-of range, or a picture that is wrong. What
-`jaxvr.units` states is to be found.
+of range, or a picture that is wrong. What `jaxvr.units` states is to be found.
 """
 
 from __future__ import annotations

@@ -27,8 +27,10 @@ from experiments import (
     kbuffer_speed,
     kbuffer_stages,
     layouts,
+    library_faults,
     limits,
     log_table,
+    mesh_faults,
     preintegration_build,
     quantised_table,
     speed,
@@ -85,6 +87,20 @@ def units_range(folder: Path) -> float:
     assert min(min(-r["from"], r["to"]) for r in double) == 957  # in steps of 319
     single = [r for r in rows if r["dtype"] == "float32"]
     return min(min(-r["from"], r["to"]) for r in single)
+
+
+def library_faults_good(folder: Path) -> float:
+    """The part of states that end well."""
+    rows = library_faults.main(["--tiny"])["states"]
+    assert any(row["rendered"] for row in rows)
+    return sum(row["outcome"] in (*library_faults.GOOD, "not tried") for row in rows) / len(rows)
+
+
+def mesh_faults_wrong(folder: Path) -> float:
+    """Pictures of eight mutants that are wrong without a word, or late."""
+    rows = mesh_faults.main(["--tiny"])["table"]
+    assert sum(row["error"] + row["status"] for row in rows) > 0
+    return sum(row["wrong"] + row["late"] for row in rows)
 
 
 def quantised_table_gain(folder: Path) -> float:
@@ -217,6 +233,8 @@ EXPERIMENTS = [
     (layouts_chord, 1e-9, 1e-6),
     (limits_cells, 5, 20),
     (units_range, 98, 100),
+    (library_faults_good, 0.999, 1.001),
+    (mesh_faults_wrong, -1, 1),
 ]
 
 

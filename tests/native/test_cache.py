@@ -126,13 +126,39 @@ def test_left_overs_of_killed_builds_go(folder):
 
 
 def test_builds_side_by_side(folder):
-    """Threads, and by the rename processes, end with one sound library."""
+    """Threads end with one sound library."""
     found = []
     threads = [
         threading.Thread(target=lambda: found.append(build.build("float32"))) for _ in range(6)
     ]
     [t.start() for t in threads], [t.join() for t in threads]
     assert len(set(found)) == 1 and len(found) == 6 and cache.is_sound(found[0])
+
+
+PROCESS = """
+import sys
+from jaxvr.native import build
+sys.stdin.readline()
+print(build.build("float32"))
+"""
+
+
+def test_processes_side_by_side(folder):
+    """Several that start together in an empty cache: each ends with a sound library, of one name,
+    and they leave nothing else."""
+    root = Path(__file__).resolve().parents[2]
+    run, pipe = [sys.executable, "-c", PROCESS], subprocess.PIPE
+    started = [
+        subprocess.Popen(run, cwd=root, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+        for _ in range(3)
+    ]
+    for process in started:  # which are all imported, or nearly so, by the time the last one is
+        assert process.stdin
+        process.stdin.write("now\n"), process.stdin.flush()
+    ends = [process.communicate() for process in started]
+    assert all(p.returncode == 0 for p in started), ends
+    (file,) = {Path(said.strip()) for said, _ in ends}
+    assert cache.is_sound(file) and list(folder.iterdir()) == [file]
 
 
 def compiler_that(folder, line):
