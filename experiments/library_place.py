@@ -119,7 +119,9 @@ def load(place: Place, state: State, render: bool) -> dict[str, Any]:
     for name, value in place.environment.items():
         os.environ.pop(name, None) if value is None else os.environ.update({name: value})
     if state.other_user and os.getuid() == 0:
-        os.setgroups([]), os.setgid(NOBODY), os.setuid(NOBODY)
+        os.setgroups([])
+        os.setgid(NOBODY)
+        os.setuid(NOBODY)
     sound = (place.base / "sound.so").read_bytes()
     mapped, real = [], ctypes.CDLL
 

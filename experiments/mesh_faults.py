@@ -33,7 +33,8 @@ import numpy as np
 import jaxvr
 from experiments.common import table
 
-OUTCOMES = ("error", "status", "right", "NaN", "wrong", "late")
+OUTCOMES = ("error", "status", "right", "NaN", "wrong", "crash", "late")
+BAD = ("wrong", "crash", "late")
 LATE = 60.0
 INTEGERS = ("cells", "neighbors", "boundary", "duplicates")
 TURNED, FLAG = 4, 8
@@ -100,7 +101,7 @@ def bits(name: str, bit: int, whole: bool) -> Callable[[Arrays, Any], None]:
     return change
 
 
-def of(name: str, change: Callable[[np.ndarray, Any], None]) -> Callable[[Arrays, Any], None]:
+def of(name: str, change: Callable[[np.ndarray, Any], Any]) -> Callable[[Arrays, Any], None]:
     return lambda arrays, rng: change(arrays[name], rng)
 
 
@@ -245,6 +246,8 @@ class Judge:
                 got, status = jax.block_until_ready(do(mutant))
         except (ValueError, jaxvr.RenderError):
             return "error"
+        except jax.errors.JaxRuntimeError as error:  # of a compiled loop's gradient, which has no
+            return "error" if "jaxvr: integers" in str(error) else "crash"  # status
         if time.monotonic() - start > LATE:
             return "late"
         if np.asarray(status).any():
@@ -291,7 +294,7 @@ def run(
                     "outcome": judge.outcome(mutant, what, do, shows),
                 }
             )
-            if rows[-1]["outcome"] in ("wrong", "late"):
+            if rows[-1]["outcome"] in BAD:
                 print(number, judge.dtype, rows[-1], flush=True)
     out = []
     for what, how in dict.fromkeys((r["what"], r["how"]) for r in rows):
@@ -303,7 +306,7 @@ def run(
                 | {k: number[k] for k in OUTCOMES}
             )
     print(table(out), flush=True)
-    wrong = Counter(f"{r['kind']} ({r['how']})" for r in rows if r["outcome"] in ("wrong", "late"))
+    wrong = Counter(f"{r['kind']} ({r['how']})" for r in rows if r["outcome"] in BAD)
     return {
         "dtypes": dtypes,
         "mutants": count,

@@ -100,7 +100,7 @@ def mesh_faults_wrong(folder: Path) -> float:
     """Pictures of eight mutants that are wrong without a word, or late."""
     rows = mesh_faults.main(["--tiny"])["table"]
     assert sum(row["error"] + row["status"] for row in rows) > 0
-    return sum(row["wrong"] + row["late"] for row in rows)
+    return sum(row[bad] for row in rows for bad in mesh_faults.BAD)
 
 
 def quantised_table_gain(folder: Path) -> float:

@@ -116,11 +116,11 @@ def hold(mesh: Any, bits: Array) -> Array:
     connectivity = _connectivity(mesh)
     if is_concrete(*connectivity):
         return bits
-    return jnp.where(_fits(*connectivity, mesh.points.shape[0]), bits, bits | BROKEN)
+    return jnp.where(_fits(mesh.points.shape[0], *connectivity), bits, bits | BROKEN)
 
 
 def _fits(
-    cells: Array, neighbors: Array, boundary: Array, duplicates: Array, n_points: int
+    n_points: int, cells: Array, neighbors: Array, boundary: Array, duplicates: Array
 ) -> Array:
     """Whether () the rules of `_require_connectivity` hold."""
     count = cells.shape[0]

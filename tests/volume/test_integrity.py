@@ -98,7 +98,7 @@ def test_changed_integers_are_found():
 def seamed():
     """Two boxes that touch in points of their own."""
     points, cells = np.asarray(MESH.points), np.asarray(MESH.cells)
-    both = np.concatenate([points, points * np.float32([-1, 1, 1])])
+    both = np.concatenate([points, points * np.array([-1, 1, 1], np.float32)])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # rows of a mesh are sorted, not oriented
         return jaxvr.TetMesh.from_cells(
