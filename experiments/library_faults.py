@@ -67,8 +67,9 @@ def attempt(place: Place, state: State, render: bool) -> dict[str, Any]:
         subprocess.run(["umount", str(place.folder)], capture_output=True)
 
 
-def try_all(many: int, every: int) -> dict[str, Any]:
-    """In a process that has computed nothing. every: one of so many states is tried."""
+def try_all(many: int, every: int, only: str | None = None) -> dict[str, Any]:
+    """In a process that has computed nothing. every: one of so many states is tried. only:
+    those of a kind."""
     warnings.simplefilter("ignore")
     jax.config.update("jax_platforms", "cpu")
     start, rows, want = time.monotonic(), [], None
@@ -82,6 +83,8 @@ def try_all(many: int, every: int) -> dict[str, Any]:
         name = build.build("float32").name
         chosen = states((base / "sound.so").read_bytes(), many)
         for number, state in enumerate(chosen[::every]):
+            if only not in (None, state.kind):
+                continue
             root = base / f"{number}"
             place = Place(base, root, name)
             plain = not state.other_user and state.kind not in ("disk", "umask", "at once")
@@ -122,17 +125,22 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--tiny", action="store_true")
+    parser.add_argument("--only", help="states of a kind")
     parser.add_argument("--here", action="store_true", help="not in a process of its own")
     args = parser.parse_args(arguments)
     if args.here:
         many, every = (4, 24) if args.tiny else (20, 1)
-        print(json.dumps(try_all(many, every)))
+        print(json.dumps(try_all(many, every, args.only)))
         return {}
     run = [sys.executable, "-m", "experiments.library_faults", "--here"]
     root = Path(__file__).resolve().parents[1]
     quiet = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3"}  # of XLA's own cache
     done = subprocess.run(
-        run + ["--tiny"] * args.tiny, cwd=root, env=quiet, stdout=subprocess.PIPE, check=True
+        run + ["--tiny"] * args.tiny + (["--only", args.only] if args.only else []),
+        cwd=root,
+        env=quiet,
+        stdout=subprocess.PIPE,
+        check=True,
     )
     report = json.loads(done.stdout.splitlines()[-1])
     report["table"] = summary(report["states"])

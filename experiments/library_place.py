@@ -22,7 +22,7 @@ from jaxvr.native import build
 
 GOOD = ("kept", "rebuilt", "JAX's loops")
 NOBODY = 65534
-PATIENCE = 90.0  # seconds for one state
+PATIENCE = 400.0  # seconds for one state; JAX's loops may have to be compiled on a busy machine
 HOME = ("HOME", "XDG_CACHE_HOME", "LOCALAPPDATA", "JAXVR_CACHE")
 
 
