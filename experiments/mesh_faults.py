@@ -177,8 +177,8 @@ def kinds() -> dict[str, Callable[[Arrays, Any], None]]:
 class Judge:
     """Views of a mesh, and the outcome of a mutant in each."""
 
-    def __init__(self, mesh: jaxvr.TetMesh, dtype: str):
-        self.mesh, self.dtype = mesh, dtype
+    def __init__(self, mesh: jaxvr.TetMesh, dtype: str, tiny: bool = False):
+        self.mesh, self.dtype, self.tiny = mesh, dtype, tiny
         self.camera = jaxvr.Camera.orbit(mesh, azimuth=31, elevation=17, width=8, height=7)
         self.transfer = jaxvr.default_transfer(mesh)
         self.draws: dict[bool, Any] = {}
@@ -215,8 +215,9 @@ class Judge:
         for native in (True, False):
             yield "render", "as it is", native, self.draws[native]
             yield "trace, shade", "as it is", native, lambda m, n=native: self.traced(m, n)
-            yield "gradient", "as it is", native, self.slopes[native]
-            for what in ("render", "gradient"):
+            if native or not self.tiny:  # JAX's own gradient takes longest to compile
+                yield "gradient", "as it is", native, self.slopes[native]
+            for what in ("render", "gradient")[: 2 if native or not self.tiny else 1]:
                 yield what, "under jit", native, self.jitted[what, native]
 
     def what_it_shows(self, mutant: Any) -> dict[str, Any] | None:
@@ -266,7 +267,9 @@ def run(
     count: int, dtypes: tuple[str, ...] = ("float32",), seed: int = 0, tiny: bool = False
 ) -> dict[str, Any]:
     """The first `count` mutants of all kinds, in turn over meshes and dtypes."""
-    judges = [Judge(m, dtype) for dtype in dtypes for m in subjects(dtype)[-1 if tiny else 0 :]]
+    judges = [
+        Judge(m, dtype, tiny) for dtype in dtypes for m in subjects(dtype)[-1 if tiny else 0 :]
+    ]
     print(f"{len(judges)} meshes", flush=True)
     changes, rows, rng = kinds(), [], np.random.default_rng(seed)
     names = list(changes)
@@ -283,8 +286,6 @@ def run(
         mutant = dataclasses.replace(judge.mesh, **{k: jnp.asarray(x) for k, x in arrays.items()})
         shows = judge.what_it_shows(mutant)
         for what, how, native, do in judge.ways():
-            if tiny and what == "gradient" and not native:  # most of the time to compile
-                continue
             rows.append(
                 {
                     "kind": kind,
