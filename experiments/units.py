@@ -8,8 +8,8 @@ compared with the picture in the units given: all bits, in both precisions, by c
 JAX's own, from a pinhole and with parallel rays, by `render` and by `shade`. The gradients of a
 weighted sum by values, points, positions, colours, extinctions, eye and target are compared too,
 each times its own power of two. Told is the range of exponents without a gap where all bits are the
-same, and what pictures outside of it are: an error in words, or a picture that is wrong. What
-`jaxvr.units` states is to be found.
+same, and what pictures outside of it are: an error in words, a gradient that is NaN by what is out
+of range, or a picture that is wrong. What `jaxvr.units` states is to be found.
 """
 
 from __future__ import annotations
@@ -139,6 +139,8 @@ def attempt(make: Any, want: list[np.ndarray], scalar: int, length: int) -> str:
         return type(error).__name__
     if all(np.array_equal(a, b) for a, b in zip(got, want, strict=True)):
         return "same bits"
+    if any(np.isnan(a).any() for a in got):
+        return "NaN"
     off = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(got, want, strict=True))
     return f"off by {off:.1g}"
 

@@ -49,6 +49,7 @@ from jaxvr.trace.recorded import Nodes, fill, record
 from jaxvr.units import mesh_in, transfer_in, units_of
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
+from jaxvr.volume.integrity import hold
 
 Array = jax.Array
 
@@ -113,6 +114,7 @@ def render(
     how = _how(pipeline, adjoint, budget, volume)
     with refusing(how[1]):
         image, bits, seen = _render(*how, volume, camera, transfer, background_of(background))
+    bits = hold(volume, bits)
     if status:
         return image, bits
     if is_concrete(bits):
@@ -156,6 +158,7 @@ def render_rays(
         rgba, bits = _render_rays(
             *how, volume, origins, directions, transfer, background_of(background)
         )
+    bits = hold(volume, bits)
     if status:
         return rgba, bits
     if is_concrete(bits):
@@ -297,7 +300,7 @@ def _shade(pipeline, adjoint, size, segments, transfer, background):
     segments = dataclasses.replace(
         segments,
         length=segments.length * units.length,
-        scalar=segments.scalar * units.scalar,
+        scalar=units.of_scalars(segments.scalar),
     )
     transfer = transfer_in(units, transfer)
     scene = pipeline.tracer.prepare(segments)

@@ -13,6 +13,10 @@ What is left is a range for the numbers themselves. With B = 100 in float32 and 
 
 or all of them are 0. Below, some of the numbers are subnormal, which XLA takes for 0; above, some
 of the extinctions, which are one over a length, are. Then the status of every ray says so.
+
+Derivatives by scalars are one over a scalar, so they need more: the largest of the scalars and
+positions is to be at most 2^B as well. Pictures above are right, but derivatives by values and
+positions are NaN there (a transform of JAX has no status to show, and 0 would be no one's notice).
 """
 
 from __future__ import annotations
@@ -25,7 +29,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core.status import LENGTHS, SCALARS, UNSORTED
-from jaxvr._core.units import exponent_of, is_large, is_none, is_small, power_of_two
+from jaxvr._core.units import exponent_of, is_large, is_none, is_small, power_of_two, times_told
 from jaxvr.optics import TransferFunction
 
 Array = jax.Array
@@ -33,11 +37,16 @@ Array = jax.Array
 
 class Units(NamedTuple):
     """length, scalar (): what the user's numbers are multiplied with, powers of two. status ():
-    bits for all rays."""
+    bits for all rays. smooth (): whether derivatives by scalars are in range."""
 
     length: Array
     scalar: Array
     status: Array
+    smooth: Array
+
+    def of_scalars(self, x: Array) -> Array:
+        """Values or positions in such units."""
+        return times_told(x, self.scalar, self.smooth)
 
 
 def units_of(lengths: Array, scalars: Array, positions: Array | None = None, parts=0) -> Units:
@@ -59,6 +68,7 @@ def units_of(lengths: Array, scalars: Array, positions: Array | None = None, par
         power_of_two(jnp.where(is_none(size), 0, -size), dtype),
         power_of_two(jnp.where(is_none(most), 0, scale), dtype),
         bits.astype(jnp.int32),
+        ~is_large(most, dtype),
     )
 
 
@@ -76,7 +86,7 @@ def _ascending(positions: Array) -> Array:
 def mesh_in(units: Units, volume: Any) -> Any:
     """A mesh in such units."""
     return dataclasses.replace(
-        volume, points=volume.points * units.length, values=volume.values * units.scalar
+        volume, points=volume.points * units.length, values=units.of_scalars(volume.values)
     )
 
 
@@ -90,6 +100,6 @@ def transfer_in(units: Units, transfer: TransferFunction) -> TransferFunction:
     positions = jnp.where(unsorted, _ascending(transfer.positions), transfer.positions)
     return dataclasses.replace(
         transfer,
-        positions=positions * units.scalar,
+        positions=units.of_scalars(positions),
         extinctions=jnp.minimum(transfer.extinctions / units.length, most),
     )

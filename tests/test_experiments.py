@@ -28,8 +28,10 @@ from experiments import (
     kbuffer_speed,
     kbuffer_stages,
     layouts,
+    library_faults,
     limits,
     log_table,
+    mesh_faults,
     preintegration_build,
     quantised_table,
     speed,
@@ -80,13 +82,26 @@ def log_table_gain(folder: Path) -> float:
 def units_range(folder: Path) -> float:
     """The exponent that scalars and lengths reach in float32 by all ways."""
     rows = units.main(["--tiny"])["rows"]
-    for row in rows:  # numbers of gradients by scalars above 2^120 are subnormal themselves
-        sides = ("beyond from",) if row["what"] == "gradients" else ("beyond from", "beyond to")
-        assert all("off" not in row[side] for side in sides), row
+    for row in rows:
+        assert "off" not in row["beyond from"] + row["beyond to"], row
     double = [r for r in rows if r["dtype"] == "float64"]
     assert min(min(-r["from"], r["to"]) for r in double) == 957  # in steps of 319
     single = [r for r in rows if r["dtype"] == "float32"]
     return min(min(-r["from"], r["to"]) for r in single)
+
+
+def library_faults_good(folder: Path) -> float:
+    """The part of states that end well."""
+    rows = library_faults.main(["--tiny"])["states"]
+    assert any(row["rendered"] for row in rows)
+    return sum(row["outcome"] in (*library_faults.GOOD, "not tried") for row in rows) / len(rows)
+
+
+def mesh_faults_wrong(folder: Path) -> float:
+    """Pictures of eight mutants that are wrong without a word, or late."""
+    rows = mesh_faults.main(["--tiny"])["table"]
+    assert sum(row["error"] + row["status"] for row in rows) > 0
+    return sum(row[bad] for row in rows for bad in mesh_faults.BAD)
 
 
 def quantised_table_gain(folder: Path) -> float:
@@ -237,6 +252,8 @@ EXPERIMENTS = [
     (layouts_chord, 1e-9, 1e-6),
     (limits_cells, 5, 20),
     (units_range, 98, 100),
+    (library_faults_good, 0.999, 1.001),
+    (mesh_faults_wrong, -1, 1),
 ]
 
 

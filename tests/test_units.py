@@ -83,6 +83,13 @@ def test_gradients_have_the_same_bits_in_any_unit(dtype):
         for name, x in got.items():
             x = np.ldexp(np.asarray(x), setting.power(name, scalar, length))
             np.testing.assert_array_equal(x, want[name], err_msg=f"{name}: {scalar}, {length}")
+    # Above, those by scalars would underflow: NaN, where 0 would be taken for an answer.
+    for scalar in (SMALL[dtype] + 1, SMALL[dtype] + 20):
+        for name, x in slopes(setting.scaled(scalar)).items():
+            if name in ("values", "positions"):
+                assert np.isnan(x).all(), name
+            else:
+                np.testing.assert_array_equal(x, want[name], err_msg=name)
 
 
 @pytest.mark.parametrize("native", [True, False])
@@ -97,6 +104,24 @@ def test_out_of_range_is_told(dtype, native):
         numbers = setting.scaled(0, exponent)
         with pytest.raises(jaxvr.RenderError, match="lengths are too small or too large.*unit"):
             setting.render(numbers, adjoint=adjoint)
+
+
+@pytest.mark.parametrize("adjoint", [jaxvr.Direct(40), jaxvr.Forward()])
+def test_derivatives_out_of_range_are_nan_in_forward_mode_too(adjoint):
+    setting = Setting("float32")
+
+    inside, outside = (setting.scaled(k) for k in (20, 101))
+    one = {k: jnp.asarray(x) for k, x in inside.items()}
+    other = {k: jnp.asarray(x) for k, x in outside.items()}
+
+    def along(numbers, name):
+        change = {name: numbers[name]}
+        rest = {k: x for k, x in numbers.items() if k != name}
+        f = jax.jit(lambda x: setting.render(rest | x, adjoint=adjoint))
+        return jax.jvp(f, ({name: numbers[name]},), (change,))[1]
+
+    assert np.isfinite(along(one, "values")).all() and np.isnan(along(other, "values")).any()
+    np.testing.assert_array_equal(along(one, "colors"), along(other, "colors"))
 
 
 def test_out_of_range_is_told_by_all_verbs():

@@ -57,6 +57,20 @@ def power_of_two(exponent: Array, dtype: Any) -> Array:
     return lax.bitcast_convert_type(bits << info.nmant, jnp.dtype(dtype))
 
 
+@jax.custom_jvp
+def times_told(x: Array, unit: Array, good: Array) -> Array:
+    """x times unit (), with derivatives that are NaN unless good () bool: for units in which they
+    would be under- or overflow without a word."""
+    del good
+    return x * unit
+
+
+@times_told.defjvp
+def _times_told(primals: Any, tangents: Any) -> Any:
+    (x, unit, good), (change, *_) = primals, tangents
+    return x * unit, change * jnp.where(good, unit, jnp.nan).astype(x.dtype)
+
+
 def near_one(x: Array) -> Array:
     """The power of two () that brings the largest size in `x` to [1/2, 1); 1 if all are 0."""
     exponent = exponent_of(x)

@@ -9,6 +9,10 @@ no C compiler is found.
 
 A loop here is a function of the typed foreign function interface of XLA (`jax.ffi`), so that it
 works under a user's `jit` and `grad` (through `Replay`), and one after the other under `vmap`.
+Ctrl-C ends these loops within a fraction of a second. It does not end JAX's own: XLA has no way to
+stop what it runs, so Python learns of it when the picture is done. Render fewer rays at a time, or
+end the process by another signal.
+
 `build` compiles and registers, `kernels` calls. To cover another noun: write it in `src/`, and say
 so in `covers`.
 """

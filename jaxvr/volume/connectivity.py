@@ -199,19 +199,38 @@ def orientations(neighbors: np.ndarray, boundary: np.ndarray) -> tuple[np.ndarra
     without a boundary and in one-sided ones, which have none.
     """
     n = len(neighbors)
-    c, k = np.nonzero(neighbors >= 0)
-    words = neighbors[c, k]
-    m, f = packing.cell_of(words), packing.corner_of(words)
-    # two copies of each cell, of either sign; a face joins those that go together
-    other = (k + f) % 2 == 0
-    rows, cols = np.r_[c, c + n], np.r_[np.where(other, m + n, m), np.where(other, m, m + n)]
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, cols)), shape=(2 * n, 2 * n))
-    count, label = connected_components(graph, directed=False)
+    count, label = _two_copies(neighbors)
     cell, sign = packing.cell_of(boundary), entry_signs(boundary)
     known = np.zeros(count, np.int8)
     known[label[np.where(sign > 0, cell, cell + n)]] = 1
     up, down = known[label[:n]], known[label[n:]]
     return (up - down).astype(np.int8), np.minimum(label[:n], label[n:])
+
+
+def _two_copies(neighbors: np.ndarray) -> tuple[int, np.ndarray]:
+    """Number of components, and the label (2 T,) of each, of two copies of the cells, upright and
+    the other way round, where a face joins those that go together."""
+    n = len(neighbors)
+    c, k = np.nonzero(neighbors >= 0)
+    words = neighbors[c, k]
+    m, f = packing.cell_of(words), packing.corner_of(words)
+    other = (k + f) % 2 == 0
+    rows, cols = np.r_[c, c + n], np.r_[np.where(other, m + n, m), np.where(other, m, m + n)]
+    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, cols)), shape=(2 * n, 2 * n))
+    count, label = connected_components(graph, directed=False)
+    return int(count), label
+
+
+def entries_agree(neighbors: np.ndarray, boundary: np.ndarray) -> np.ndarray:
+    """Whether no `entry` bit in the component of a boundary face (F,) contradicts its own: all of a
+    component follow from one of them. (One-sided components have no such rule.)"""
+    n = len(neighbors)
+    count, label = _two_copies(neighbors)
+    cell, up = packing.cell_of(boundary), entry_signs(boundary) > 0
+    mine, opposite = label[np.where(up, cell, cell + n)], label[np.where(up, cell + n, cell)]
+    said = np.zeros(count, bool)
+    said[mine] = True
+    return ~said[opposite] | (mine == opposite)
 
 
 def entry_signs(boundary: np.ndarray) -> np.ndarray:

@@ -7,8 +7,11 @@ look before they start, at each array once: those of a mesh that was built are k
 
 The checks are those of the invariants in `TetMesh`: kinds and shapes; points and values finite; the
 corners of a cell four different points in the order of their welded ids; the cell across a face
-names this one in return, and has the face's three points; and each face without a neighbour is in
-the boundary, once.
+names this one in return, and has the face's three points; each face without a neighbour is in the
+boundary, once; and the bits follow from each other: all words that name a cell have it turned or
+none, a seam is where ids differ, the entries of a component go together, and fit its points.
+
+Under a user's jit nothing is known; there `hold` makes a status of most of it.
 """
 
 from __future__ import annotations
@@ -17,11 +20,16 @@ import weakref
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .._core.checks import is_concrete, require_finite
+from .._core.status import BROKEN
 from . import packing
-from .connectivity import FACES
+from .connectivity import FACES, entries_agree
+from .mirror import mirrored
+
+Array = jax.Array
 
 _ADVICE = (
     "Connectivity cannot be computed with: apply functions such as jax.tree.map to mesh.points and "
@@ -59,23 +67,92 @@ def trust(mesh: Any) -> Any:
     _remember(_connectivity(mesh), mesh.points.shape[0])
     _remember((mesh.points,))
     _remember((mesh.values,))
+    return trust_entries(mesh)
+
+
+def trust_entries(mesh: Any) -> Any:
+    """The mesh, whose `entry` bits are known to fit its points."""
+    _remember((mesh.points, *_connectivity(mesh)))
     return mesh
 
 
 def require_mesh(mesh: Any) -> None:
     """ValueError that names the array and the first entry that is wrong. Of numbers that are traced
     only kinds and shapes are looked at."""
-    connectivity = _connectivity(mesh)
-    _require_kinds(mesh)
+    require_connectivity(mesh)
     for name, x in (("points", mesh.points), ("values", mesh.values)):
         if is_concrete(x) and not _is_known((x,)):
             require_finite(f"mesh.{name}", x)
             _remember((x,))
+    connectivity = _connectivity(mesh)
+    if is_concrete(mesh.points, *connectivity) and not _is_known((mesh.points, *connectivity)):
+        if mirrored(mesh.points, mesh.cells, mesh.neighbors, mesh.boundary)[0] is not None:
+            raise ValueError(
+                "mesh.points turn the mesh, or a component of it, inside out, and mesh.boundary "
+                "still says where rays entered before: the picture would be blank. Points that "
+                "were mirrored go through mesh.replace(points=...)."
+            )
+        trust_entries(mesh)
+
+
+def require_connectivity(mesh: Any) -> None:
+    """The part of `require_mesh` that is about integers, whatever the numbers are."""
+    _require_kinds(mesh)
+    connectivity = _connectivity(mesh)
     n_points = mesh.points.shape[0]
     if is_concrete(*connectivity) and not _is_known(connectivity, n_points):
         cells, neighbors, boundary, duplicates = map(np.asarray, connectivity)
         _require_connectivity(cells, neighbors, boundary, duplicates, n_points)
         _remember(connectivity, n_points)
+
+
+def hold(mesh: Any, bits: Array) -> Array:
+    """Status bits of any shape, with BROKEN where integers are traced and not those of a mesh.
+
+    Of what `require_mesh` finds, this leaves out the `entry` bits, whose components are not known
+    here. It costs as much as some tens of thousands of rays, and nothing where integers are known:
+    close over the mesh, and pass `mesh.replace(...)` what is traced.
+    """
+    connectivity = _connectivity(mesh)
+    if is_concrete(*connectivity):
+        return bits
+    return jnp.where(_fits(mesh.points.shape[0], *connectivity), bits, bits | BROKEN)
+
+
+def _fits(
+    n_points: int, cells: Array, neighbors: Array, boundary: Array, duplicates: Array
+) -> Array:
+    """Whether () the rules of `_require_connectivity` hold."""
+    count = cells.shape[0]
+    good = jnp.all((cells >= 0) & (cells < n_points))
+    good &= jnp.all((duplicates >= 0) & (duplicates < n_points))
+    rows = cells
+    if len(duplicates):
+        welded = jnp.arange(n_points, dtype=jnp.int32).at[duplicates[:, 0]].set(duplicates[:, 1])
+        rows = welded[jnp.clip(cells, 0, n_points - 1)]
+    good &= jnp.all(rows[:, 1:] > rows[:, :-1])
+    good &= jnp.all((neighbors >= -1) & (packing.cell_of(neighbors) < count))
+    joined = neighbors >= 0
+    cell = jnp.clip(packing.cell_of(neighbors), 0, count - 1)
+    corner = packing.corner_of(neighbors)
+    back = neighbors[cell, corner]
+    here = jnp.arange(count, dtype=jnp.int32)[:, None], jnp.arange(4, dtype=jnp.int32)[None]
+    good &= jnp.all(
+        ~joined | (packing.cell_of(back) == here[0]) & (packing.corner_of(back) == here[1])
+    )
+    faces = jnp.asarray(FACES)
+    there = cell[..., None], faces[corner]
+    good &= jnp.all(~joined[..., None] | (rows[there] == rows[:, faces]))
+    # Without coincident points ids agree wherever faces do.
+    seam = jnp.any(cells[there] != cells[:, faces], axis=-1) if len(duplicates) else False
+    good &= jnp.all(~joined | (packing.flag_of(neighbors) == seam))
+    # Each face without a neighbour has one word, which is the one that names the cell there.
+    good &= jnp.all((boundary >= 0) & (packing.cell_of(boundary) < count))
+    at = jnp.clip(packing.cell_of(boundary), 0, count - 1), packing.corner_of(boundary)
+    times = jnp.zeros((count, 4), jnp.int32).at[at].add(1)
+    good &= jnp.all(times == ~joined)
+    turned = packing.turned_of(jnp.where(joined, back, 0).at[at].max(boundary))
+    return good & jnp.all(turned == turned[:, :1])
 
 
 def _require_kinds(mesh: Any) -> None:
@@ -147,3 +224,20 @@ def _require_connectivity(
             f"mesh.boundary is not that of a mesh: it does not have each of the {open_faces} faces "
             f"without a neighbour. {_ADVICE}"
         )
+    _require_bits(cells, neighbors, boundary)
+
+
+def _require_bits(cells: np.ndarray, neighbors: np.ndarray, boundary: np.ndarray) -> None:
+    """For integers that fit each other but for their bits."""
+    joined = neighbors >= 0
+    there = np.maximum(packing.cell_of(neighbors), 0), packing.corner_of(neighbors)
+    seam = (cells[there[0][..., None], FACES[there[1]]] != cells[:, FACES]).any(-1)
+    right = ~joined | (packing.flag_of(neighbors) == seam)
+    _require(right, "neighbors", neighbors, "have a seam bit that ids deny")
+    naming = np.where(joined, neighbors[there], 0)  # the four words that name each cell
+    naming[packing.cell_of(boundary), packing.corner_of(boundary)] = boundary
+    turned = packing.turned_of(naming)
+    alike = turned == turned[:, :1]
+    _require(alike, "neighbors", neighbors, "are of a cell that some call turned and some do not")
+    agree = entries_agree(neighbors, boundary)
+    _require(agree, "boundary", boundary, "have an entry bit that others in the component deny")

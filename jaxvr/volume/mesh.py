@@ -14,7 +14,7 @@ import numpy as np
 from .._core.checks import as_floats, is_concrete, require_finite, require_shape
 from .._core.pytree import pytree, static
 from .build import build
-from .integrity import trust
+from .integrity import require_connectivity, trust, trust_entries
 from .mirror import mirrored
 from .report import MeshReport
 from .values import choose_location, place, rounded
@@ -139,13 +139,16 @@ class TetMesh:
         turned over without that, a warning says how many cells are. Inside tracing nothing is.
         """
         new: dict[str, Any] = {}
+        looked = False
         if points is not None:
             new["points"] = self._floats("points", points)
             require_shape("points", new["points"], self.points.shape)
             if is_concrete(new["points"], self.cells, self.neighbors, self.boundary):
+                require_connectivity(self)
                 found, message = mirrored(new["points"], self.cells, self.neighbors, self.boundary)
                 if found is not None:
                     new["boundary"] = jnp.asarray(found)
+                looked = True
                 if message:
                     warnings.warn(message, UserWarning, stacklevel=2)
         if values is not None:
@@ -157,7 +160,8 @@ class TetMesh:
             new["location"] = choose_location(v.shape, sizes, location)
         elif location is not None:
             raise ValueError("location says where values live: pass values too.")
-        return dataclasses.replace(self, **new)
+        changed = dataclasses.replace(self, **new)
+        return trust_entries(changed) if looked else changed
 
     def _floats(self, name: str, x: Any) -> Array:
         with np.errstate(over="ignore"):  # too large for the dtype is infinite, and found below

@@ -126,13 +126,44 @@ def test_left_overs_of_killed_builds_go(folder):
 
 
 def test_builds_side_by_side(folder):
-    """Threads, and by the rename processes, end with one sound library."""
+    """Threads end with one sound library."""
     found = []
     threads = [
         threading.Thread(target=lambda: found.append(build.build("float32"))) for _ in range(6)
     ]
     [t.start() for t in threads], [t.join() for t in threads]
     assert len(set(found)) == 1 and len(found) == 6 and cache.is_sound(found[0])
+
+
+PROCESSES = """
+import os, sys
+from jaxvr.native import build
+start, go = os.pipe()
+children = []
+for _ in range(8):  # nothing was computed yet, so there are no threads to lose
+    if not (child := os.fork()):
+        os.close(go)
+        os.read(start, 1)  # until the parent has made all of them
+        try:
+            print(build.build("float32"), flush=True)
+        finally:
+            os._exit(0)
+    children.append(child)
+os.close(go)
+[os.waitpid(child, 0) for child in children]
+"""
+
+
+def test_processes_side_by_side(folder):
+    """Several that start together in an empty cache: each ends with a sound library, of one name,
+    and they leave nothing else."""
+    root = Path(__file__).resolve().parents[2]
+    run = [sys.executable, "-W", "ignore", "-c", PROCESSES]
+    done = subprocess.run(run, cwd=root, capture_output=True, text=True)
+    found = done.stdout.split()
+    assert len(found) == 8, done.stdout + done.stderr
+    (file,) = {Path(name) for name in found}
+    assert cache.is_sound(file) and list(folder.iterdir()) == [file]
 
 
 def compiler_that(folder, line):
