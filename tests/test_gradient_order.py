@@ -1,8 +1,8 @@
 """Gradients do not depend on what was differentiated before, nor on which pullbacks are alive.
 
 Each gradient alone against itself in company: see `orders`. What is compiled follows from what is
-traced, so most programs are only traced here; `python -m experiments.state_machine --orders 200 --run`
-runs more of them, on both engines and in both precisions, and compares bits.
+traced, so most programs are only traced here; `python -m experiments.state_machine --orders 200
+--run` runs more of them, on both engines and in both precisions, and compares bits.
 """
 
 from __future__ import annotations
