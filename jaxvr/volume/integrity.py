@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.checks import is_concrete, require_finite
-from .._core.status import BROKEN
+from .._core.status import BROKEN, LOST
 from . import packing
 from .connectivity import FACES, entries_agree
 from .mirror import mirrored
@@ -107,12 +107,15 @@ def require_connectivity(mesh: Any) -> None:
 
 
 def hold(mesh: Any, bits: Array) -> Array:
-    """Status bits of any shape, with BROKEN where integers are traced and not those of a mesh.
+    """Status bits of any shape, with BROKEN where integers are traced and not those of a mesh, and
+    LOST where points are and are not finite.
 
     Of what `require_mesh` finds, this leaves out the `entry` bits, whose components are not known
     here. It costs as much as some tens of thousands of rays, and nothing where integers are known:
     close over the mesh, and pass `mesh.replace(...)` what is traced.
     """
+    if not is_concrete(mesh.points):  # a ray may pass a face that is nowhere without meeting it
+        bits = jnp.where(jnp.isfinite(mesh.points).all(), bits, bits | LOST)
     connectivity = _connectivity(mesh)
     if is_concrete(*connectivity):
         return bits

@@ -188,9 +188,12 @@ def test_gradients_across_flat_and_overturned_cells(direction, quick_jit):
     )
     for points in (mesh.points, jnp.asarray(flat.moved(shape))):
         ours, theirs = (g(points, mesh.values, origins) for g in (found, wanted))
-        for a, b in zip(ours, theirs, strict=True):
+        # On the outside, flat cells stay: of faces in one place, either may be the one that is met.
+        where = slice(None) if points is mesh.points else shape.inner
+        for i, (a, b) in enumerate(zip(ours, theirs, strict=True)):
             scale = np.abs(b).max()
             assert scale > 0.1
+            a, b = (x[where] if i == 0 else x for x in (a, b))
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * scale)
     along = jax.jit(
         lambda h: f(points + h * move, mesh.values + h * change, origins + 0.1 * h * shift)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jaxvr
-from jaxvr._core.status import BROKEN, UNSORTED
+from jaxvr._core.status import BROKEN, LOST, UNSORTED
 from jaxvr.volume.integrity import hold, require_mesh
 
 MESH = jaxvr.datasets.box((2, 2, 1), field=lambda p: p[:, 0] + 0.2 * p[:, 1], dtype="float32")
@@ -73,6 +73,14 @@ def test_numbers_that_are_not_finite_are_an_error():
         broken = changed(**{name: getattr(MESH, name).at[3].set(jnp.nan)})
         with pytest.raises(ValueError, match=rf"mesh\.{name}"):
             jaxvr.render(broken, CAMERA, TRANSFER)
+
+
+def test_traced_points_that_are_not_finite_are_told_to_all_rays():
+    """A ray that passes a face which is nowhere meets nothing that could tell."""
+    fits = jax.jit(lambda m: hold(m, jnp.zeros(2, jnp.int32)))
+    for number in (jnp.nan, jnp.inf):
+        assert (fits(changed(points=MESH.points.at[3, 1].set(number))) == LOST).all()
+    assert not fits(MESH).any()
 
 
 def test_integers_of_another_mesh():
