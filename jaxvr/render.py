@@ -49,7 +49,7 @@ from jaxvr.trace.recorded import Nodes, fill, record
 from jaxvr.units import mesh_in, transfer_in, units_of
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
-from jaxvr.volume.integrity import hold
+from jaxvr.volume.integrity import hold, unasked
 
 Array = jax.Array
 
@@ -120,7 +120,7 @@ def render(
     if is_concrete(bits):
         check(bits)
         hints.look(volume, camera, transfer, seen, stacklevel=2)
-    return image
+    return unasked(volume, image, bits)
 
 
 def render_rays(
@@ -163,7 +163,7 @@ def render_rays(
         return rgba, bits
     if is_concrete(bits):
         check(bits)
-    return rgba
+    return unasked(volume, rgba, bits)
 
 
 def trace(

@@ -122,6 +122,15 @@ def hold(mesh: Any, bits: Array) -> Array:
     return jnp.where(_fits(mesh.points.shape[0], *connectivity), bits, bits | BROKEN)
 
 
+def unasked(mesh: Any, image: Array, bits: Array) -> Array:
+    """An image (..., 4) whose status (...) nobody asks for: NaN, and so are gradients, where `hold`
+    found the integers broken. Without that a wrong picture would look like another."""
+    if is_concrete(bits) or is_concrete(*_connectivity(mesh)):
+        return image
+    broken = (bits & BROKEN) != 0
+    return image * jnp.where(broken, jnp.nan, 1).astype(image.dtype)[..., None]
+
+
 def _fits(
     n_points: int, cells: Array, neighbors: Array, boundary: Array, duplicates: Array
 ) -> Array:

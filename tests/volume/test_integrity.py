@@ -187,6 +187,21 @@ def test_traced_integers_end_in_a_status(engine):
             assert (bits & BROKEN).all(), (name, x[x != old], old[x != old])
 
 
+def test_a_picture_of_broken_integers_is_nan_where_no_status_is_asked_for():
+    """Of compiled loops the gradient is an error as well."""
+
+    def loss(values, mesh):
+        mesh = dataclasses.replace(mesh, values=values)
+        image = jaxvr.render(mesh, CAMERA, TRANSFER, adjoint=ENGINES["jax"])
+        return image.sum(), image
+
+    draw = jax.jit(jax.grad(loss, has_aux=True))
+    gradient, image = draw(MESH.values, MESH)
+    assert np.isfinite(gradient).all() and np.isfinite(image).all() and gradient.any()
+    gradient, image = draw(MESH.values, changed(neighbors=MESH.neighbors.at[0].add(1 << 20)))
+    assert np.isnan(gradient).any() and np.isnan(image).all()
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 def test_rings_end(engine):
     """Each cell's neighbour across any face is the cell itself: a walk that never leaves."""
