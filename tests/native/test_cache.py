@@ -145,7 +145,7 @@ for _ in range(8):  # nothing was computed yet, so there are no threads to lose
         os.close(go)
         os.read(start, 1)  # until the parent has made all of them
         try:
-            print(build.build("float32"), flush=True)
+            os.write(1, f"{build.build('float32')}\\n".encode())  # a line at once, among eight
         finally:
             os._exit(0)
     children.append(child)
