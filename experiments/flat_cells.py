@@ -55,6 +55,7 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.append(str(ROOT))  # last: another checkout's package comes before this one's
 
+from experiments.data import path_of  # noqa: E402
 from tests import flat_meshes as flat  # noqa: E402
 
 LIMITS = (1e-4, 1e-3)
@@ -62,7 +63,6 @@ DTYPES = ("float32", "float64")
 BATCH = 1 << 17
 TRIES = 100  # of meshes nearby
 LOOKED_AT = 10_000  # rays that are off, the least first, whose error rounding may explain
-DATA = Path(os.environ.get("JAXVR_DATA", ROOT.parent / "shared" / "data"))
 FIELDS = {"bluntfin": "density", "oxygen_post": "speed"}
 MOVED = "lattice, moved"
 DEPTH = 0.3  # of the homogeneous medium, along the shortest of the lengths that share one
@@ -403,12 +403,14 @@ def seconds(size: int, repeat: int) -> dict[str, Any]:
 
     tasks: dict[str, Callable[[], Any]] = {}
     for name, field in FIELDS.items():
-        if not (DATA / f"{name}.vtu").exists():
-            print(f"{name} is not in {DATA}")
+        try:
+            path = path_of(f"{name}.vtu")
+        except FileNotFoundError as error:
+            print(error)
             continue
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            mesh = jaxvr.read_mesh(DATA / f"{name}.vtu", field, "float32")
+            mesh = jaxvr.read_mesh(path, field, "float32")
         view = mesh, camera_of(mesh, size), transfer_of(mesh)
         tasks[name] = lambda view=view: jaxvr.render(*view)
     out = {}
@@ -425,7 +427,9 @@ def elsewhere(folder: Path, arguments: list[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as scratch:
         file = Path(scratch, "report.json")
         command = [sys.executable, __file__, *arguments, "--json", str(file)]
-        path = os.pathsep.join([str(folder.resolve()), os.environ.get("PYTHONPATH", "")])
+        # Of that folder the package only: what else is imported is of this checkout.
+        Path(scratch, "jaxvr").symlink_to(folder.resolve() / "jaxvr", target_is_directory=True)
+        path = os.pathsep.join([scratch, os.environ.get("PYTHONPATH", "")])
         subprocess.run(command, check=True, env=os.environ | {"PYTHONPATH": path})
         return json.loads(file.read_text())["after"]
 

@@ -7,7 +7,7 @@ flat cells there, and cells that rounding turned over. Without them the others d
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay
@@ -87,6 +87,15 @@ def moved(mesh: FlatMesh, by: float = 0.02, seed: int = 1) -> np.ndarray:
     """Its points (P, 3) with the inner ones moved by normal deviates times `by`."""
     moves = np.random.default_rng(seed).normal(size=mesh.points.shape)
     return mesh.points + by * moves * mesh.inner[:, None]
+
+
+def one_sided(f: Callable[[float], Any], h: float) -> float:
+    """Derivative of f at 0 from the side of h, extrapolated to step 0 from three steps."""
+
+    def slope(h: float) -> float:
+        return (float(f(h)) - float(f(0.0))) / h
+
+    return (8 * slope(h / 4) - 6 * slope(h / 2) + slope(h)) / 3
 
 
 MESHES: dict[str, Callable[[], FlatMesh]] = {

@@ -70,15 +70,6 @@ def field(p):
     return p[:, 0] + 0.3 * p[:, 1] ** 2 - 0.2 * p[:, 2] * p[:, 0]
 
 
-def one_sided(f, h):
-    """Derivative of f at 0 from the side of h, extrapolated to step 0 from three steps."""
-
-    def slope(h):
-        return (float(f(h)) - float(f(0.0))) / h
-
-    return (8 * slope(h / 4) - 6 * slope(h / 2) + slope(h)) / 3
-
-
 def test_gradient_by_points_across_overturned_cells():
     """Cells turned over for good: the depth reached is that of an earlier face, and moves with it.
     Points and rays move together."""
@@ -102,7 +93,7 @@ def test_gradient_by_points_across_overturned_cells():
 
     found = float(jax.grad(f)(0.0))
     for h in (1e-5, -1e-5):
-        assert found == pytest.approx(one_sided(f, h), rel=1e-6)
+        assert found == pytest.approx(flat.one_sided(f, h), rel=1e-6)
 
 
 def test_gradient_by_points_at_a_flat_cell_is_that_of_the_side_with_volume():
@@ -134,5 +125,5 @@ def test_gradient_by_points_at_a_flat_cell_is_that_of_the_side_with_volume():
         return jaxvr.render_rays(moved, target - 2 * direction, direction, tf)[:, :3].sum()
 
     found = float(jax.grad(f)(0.0))
-    assert found == pytest.approx(one_sided(f, proper * 1e-5), rel=1e-6)
-    assert found != pytest.approx(one_sided(f, -proper * 1e-5), rel=1e-3)
+    assert found == pytest.approx(flat.one_sided(f, proper * 1e-5), rel=1e-6)
+    assert found != pytest.approx(flat.one_sided(f, -proper * 1e-5), rel=1e-3)

@@ -149,15 +149,6 @@ def test_the_closest_two_are_the_ends_of_a_segment_or_it_is_told(direction):
         jaxvr.check(status)
 
 
-def one_sided(f, h):
-    """Derivative of f at 0 from the side of h, extrapolated to step 0 from three steps."""
-
-    def slope(h):
-        return (float(f(h)) - float(f(0.0))) / h
-
-    return (8 * slope(h / 4) - 6 * slope(h / 2) + slope(h)) / 3
-
-
 @pytest.mark.parametrize("direction", ["front to back", "back to front"])
 def test_gradients_across_flat_and_overturned_cells(direction, quick_jit):
     """By points, values and rays: those of ray casting and, where cells are overturned for good, of
@@ -200,4 +191,4 @@ def test_gradients_across_flat_and_overturned_cells(direction, quick_jit):
     )
     slope = sum((g * x).sum() for g, x in zip(ours, (move, change, 0.1 * shift), strict=True))
     for h in (1e-6, -1e-6):
-        assert float(slope) == pytest.approx(one_sided(along, h), rel=1e-6)
+        assert float(slope) == pytest.approx(flat.one_sided(along, h), rel=1e-6)
