@@ -58,9 +58,10 @@ _MEANING = {  # what explains others first
         'only with `pairs="closest"`, or at an eye inside of several of them.',
     ),
     BROKEN: (
-        "met integers that are out of range or do not fit together",
+        "met integers that are out of range or do not fit together, or not the points",
         "Integers of a mesh are names of points, cells and faces, and not to be computed with: "
-        "average, step or scale its `points` and `values` only, with `mesh.replace`.",
+        "average, step or scale its `points` and `values` only, with `mesh.replace`. Points that "
+        "mirror the mesh go through it outside of `jit`, where the integers follow them.",
     ),
 }
 

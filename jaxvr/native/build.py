@@ -120,7 +120,7 @@ def _processor() -> str:
 def cache_folder() -> tuple[Path, str | None]:
     """Where libraries are kept, and what to say where that is no place for long."""
     chosen = os.environ.get("JAXVR_CACHE")
-    return (Path(chosen), None) if chosen else cache.default_folder()
+    return (Path(chosen).expanduser(), None) if chosen else cache.default_folder()
 
 
 def build(dtype: str) -> Path:
@@ -296,7 +296,7 @@ def _depends() -> Any:
         folder = cache_folder()[0]
         status = folder.stat()
         place = (status.st_mode, status.st_uid, os.access(folder, os.W_OK))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: a ~ of no user
         place = None
     return environment, tool, made, place
 

@@ -38,17 +38,37 @@ def is_ours(status: os.stat_result, *, roots: bool = True) -> bool:
 
 def default_folder() -> tuple[Path, str | None]:
     """Where libraries go unless the environment says otherwise, and None; without a home, a folder
-    of this user's own among the temporary ones, and what to say about it."""
-    try:
-        home = os.environ.get("LOCALAPPDATA") or os.environ.get("XDG_CACHE_HOME")
-        return (Path(home) if home else Path.home() / ".cache") / "jaxvr", None
-    except RuntimeError:  # no HOME, and no entry for this user
-        folder = Path(tempfile.gettempdir()) / f"jaxvr-{_user()}"
-        remark = (
-            f"There is no home folder, so jaxvr keeps what it has compiled in {folder}. Set "
-            "JAXVR_CACHE to a folder that stays, or it will be compiled again."
-        )
-        return folder, remark
+    of this user's own among the temporary ones, and what to say about it. Never a place that
+    depends on where the process happens to run: a relative XDG_CACHE_HOME is passed over, as the
+    XDG Base Directory Specification asks.
+
+    Raises:
+      OSError: if there is no home, and no folder for temporary files either.
+    """
+    for name in ("LOCALAPPDATA", "XDG_CACHE_HOME"):
+        path = Path(os.environ.get(name, ""))
+        if path.is_absolute():
+            return path / "jaxvr", None
+    with contextlib.suppress(RuntimeError):  # no HOME, and no entry for this user
+        home = Path.home()
+        if home.is_absolute():
+            return home / ".cache" / "jaxvr", None
+    folder = _temporary() / f"jaxvr-{_user()}"
+    remark = (
+        f"There is no home folder, so jaxvr keeps what it has compiled in {folder}. Set "
+        "JAXVR_CACHE to a folder that stays, or it will be compiled again."
+    )
+    return folder, remark
+
+
+def _temporary() -> Path:
+    """The folder for temporary files; not the working folder, which is `tempfile`'s last resort."""
+    folder = Path(tempfile.gettempdir())
+    named = (os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))
+    known = [Path(x) for x in (*named, "/tmp", "/var/tmp", "/usr/tmp") if x]
+    if folder == Path.cwd() and folder not in known:
+        raise FileNotFoundError("there is neither a home folder nor one for temporary files")
+    return folder
 
 
 def _user() -> str:

@@ -324,7 +324,7 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
     s = np.where(flat, 0, s[keep]).astype(np.int8)
     swap = np.where(odd, -1, 1)
     orientation = conn.fill_signs(swap * s, swap * volume, pairs)
-    turned, one_sided = conn.combinatorial(orientation, pairs, flat)
+    turned, one_sided = conn.combinatorial(orientation, pairs, np.where(flat, 0.0, abs(volume)))
     flat[turned] |= _longest(pts, rows[turned]) ** 3 * _RESOLVED >= np.abs(volume[turned])
     # the sign of a flat cell is free, so it is never the one that lies the wrong way round
     orientation[turned & flat] *= -1

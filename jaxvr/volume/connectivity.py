@@ -156,15 +156,16 @@ def _spread_signs(sign: np.ndarray, ends: np.ndarray) -> np.ndarray:
 
 
 def combinatorial(
-    sign: np.ndarray, pairs: np.ndarray, flat: np.ndarray | None = None
+    sign: np.ndarray, pairs: np.ndarray, size: np.ndarray | None = None
 ) -> tuple[np.ndarray, int]:
     """Which cells lie the wrong way round among their neighbours.
 
-    sign (T,): geometric orientation of each sorted row, 1 or -1; pairs from `match_faces`. flat
-    (T,) bool: cells whose sign is a guess, and has no vote.
+    sign (T,): geometric orientation of each sorted row, 1 or -1; pairs from `match_faces`. size
+    (T,): the weight of each cell's vote, its volume; 0 where the sign is a guess, else all equal.
     Returns turned (T,) bool, the cells whose geometric sign differs from the consistent one, and
     the number of components that have none (one-sided, as a Moebius band is; turned is False
-    there). The overall sign of a component is that of most of its cells.
+    there). The overall sign of a component is that of most of its volume, so that its boundary
+    encloses a positive one.
     """
     n = len(sign)
     c, k, m, f = pairs.T
@@ -181,8 +182,8 @@ def combinatorial(
     count, label = connected_components(graph, directed=False)
     upright, other = label[:patches], label[patches:]
     one_sided = upright == other
-    # each orientable component appears twice, mirrored: keep the copy with more upright cells
-    votes = np.bincount(patch, None if flat is None else ~flat, minlength=patches)
+    # each orientable component appears twice, mirrored: keep the copy with more upright volume
+    votes = np.bincount(patch, size, minlength=patches)
     cells_upright = np.bincount(upright, votes, minlength=count)
     more = cells_upright[upright] - cells_upright[other]
     flip = (more < 0) | ((more == 0) & (upright > other))

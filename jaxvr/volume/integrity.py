@@ -22,12 +22,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from .._core.checks import is_concrete, require_finite
 from .._core.status import BROKEN, LOST
 from . import packing
 from .connectivity import FACES, entries_agree
-from .mirror import mirrored
+from .mirror import enclosed, mirrored
 
 Array = jax.Array
 
@@ -107,28 +108,78 @@ def require_connectivity(mesh: Any) -> None:
 
 
 def hold(mesh: Any, bits: Array) -> Array:
-    """Status bits of any shape, with BROKEN where integers are traced and not those of a mesh, and
-    LOST where points are and are not finite.
+    """Status bits of any shape, with BROKEN where integers are traced and not those of a mesh, or
+    where traced points turn the mesh inside out, and LOST where points are not finite.
 
-    Of what `require_mesh` finds, this leaves out the `entry` bits, whose components are not known
-    here. It costs as much as some tens of thousands of rays, and nothing where integers are known:
-    close over the mesh, and pass `mesh.replace(...)` what is traced.
+    Of what `require_mesh` finds, this leaves out single components that are inside out in a mesh
+    that as a whole is not. It costs as much as some tens of thousands of rays where integers are
+    traced, a pass over the boundary where points are, and nothing where both are known: close over
+    the mesh, and pass `mesh.replace(...)` what is traced.
     """
-    if not is_concrete(mesh.points):  # a ray may pass a face that is nowhere without meeting it
-        bits = jnp.where(jnp.isfinite(mesh.points).all(), bits, bits | LOST)
-    connectivity = _connectivity(mesh)
-    if is_concrete(*connectivity):
+    if not _is_traced(mesh):
         return bits
-    return jnp.where(_fits(mesh.points.shape[0], *connectivity), bits, bits | BROKEN)
+    good = _is_right_way_round(mesh)
+    if not is_concrete(*_connectivity(mesh)):
+        good &= _fits(mesh.points.shape[0], *_connectivity(mesh))
+        if not mesh.report.one_sided:  # such components have no rule for their entries
+            good &= _is_closed(mesh)
+    bits = jnp.where(good, bits, bits | BROKEN)
+    # a ray may pass a face that is nowhere without meeting it
+    return jnp.where(jnp.isfinite(mesh.points).all(), bits, bits | LOST)
 
 
 def unasked(mesh: Any, image: Array, bits: Array) -> Array:
     """An image (..., 4) whose status (...) nobody asks for: NaN, and so are gradients, where `hold`
-    found the integers broken. Without that a wrong picture would look like another."""
-    if is_concrete(bits) or is_concrete(*_connectivity(mesh)):
+    found the mesh broken. Without that a wrong picture would look like another."""
+    if is_concrete(bits) or not _is_traced(mesh):
         return image
     broken = (bits & BROKEN) != 0
     return image * jnp.where(broken, jnp.nan, 1).astype(image.dtype)[..., None]
+
+
+def _is_traced(mesh: Any) -> bool:
+    return not is_concrete(mesh.points, *_connectivity(mesh))
+
+
+def _is_right_way_round(mesh: Any) -> Array:
+    """Whether () the boundary encloses a volume that is not below 0, but for rounding."""
+    if not mesh.boundary.shape[0]:
+        return jnp.asarray(True)
+    volume, error = enclosed(lax.stop_gradient(mesh.points), mesh.cells, mesh.boundary, jnp)
+    return ~(volume.sum() < -error.sum())
+
+
+def _is_closed(mesh: Any) -> Array:
+    """Whether () the faces of the boundary, as `entry` bits orient them, pass each edge as often in
+    one direction as in the other: then the bits fit each other, at least within each component.
+
+    Edges are added up as random numbers, forwards and with a minus backwards; a sum of 0 in 32 bits
+    has a chance of 2^-32 otherwise.
+    """
+    rows, words = _welded(mesh.cells, mesh.duplicates, mesh.points.shape[0]), mesh.boundary
+    cell = jnp.clip(packing.cell_of(words), 0, rows.shape[0] - 1)
+    face = jnp.asarray(FACES)[packing.corner_of(words)]
+    a, b, c = jnp.take_along_axis(rows[cell], face, axis=1).T
+    total = _noise(a, b) + _noise(b, c) - _noise(a, c)
+    total = jnp.where(packing.flag_of(words) == 1, -total, total)
+    return jnp.sum(total, dtype=jnp.uint32) == 0
+
+
+def _noise(i: Array, j: Array) -> Array:
+    """Numbers (...) uint32 that look random, of pairs of integers: the finaliser of MurmurHash3."""
+    x = i.astype(jnp.uint32) * np.uint32(0x9E3779B1) ^ j.astype(jnp.uint32)
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+        x = (x ^ (x >> shift)) * np.uint32(factor)
+        x = x + j.astype(jnp.uint32) * np.uint32(0x27D4EB2F)
+    return x ^ (x >> 16)
+
+
+def _welded(cells: Array, duplicates: Array, n_points: int) -> Array:
+    """Rows (T, 4) with the welded ids of their points."""
+    if not len(duplicates):
+        return cells
+    welded = jnp.arange(n_points, dtype=jnp.int32).at[duplicates[:, 0]].set(duplicates[:, 1])
+    return welded[jnp.clip(cells, 0, n_points - 1)]
 
 
 def _fits(
@@ -138,10 +189,7 @@ def _fits(
     count = cells.shape[0]
     good = jnp.all((cells >= 0) & (cells < n_points))
     good &= jnp.all((duplicates >= 0) & (duplicates < n_points))
-    rows = cells
-    if len(duplicates):
-        welded = jnp.arange(n_points, dtype=jnp.int32).at[duplicates[:, 0]].set(duplicates[:, 1])
-        rows = welded[jnp.clip(cells, 0, n_points - 1)]
+    rows = _welded(cells, duplicates, n_points)
     good &= jnp.all(rows[:, 1:] > rows[:, :-1])
     good &= jnp.all((neighbors >= -1) & (packing.cell_of(neighbors) < count))
     joined = neighbors >= 0

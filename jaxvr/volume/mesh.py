@@ -134,9 +134,10 @@ class TetMesh:
         tracing, for NaN or infinite entries.
 
         Points that mirror the mesh (an axis with another sign, two axes swapped), or a part of it
-        that hangs together, turn all cells over: outside tracing that is seen at the boundary, and
-        its `entry` bits go with it. Where more than a quarter of the volume at the boundary is
-        turned over without that, a warning says how many cells are. Inside tracing nothing is.
+        that hangs together, turn all cells over: outside tracing its `entry` bits go with it. Where
+        more than a quarter of the volume at the boundary is turned over without that, a warning
+        says how many cells are. Inside tracing the bits stay: there a mesh that is mirrored as a
+        whole ends in a status, or in a picture of NaN.
         """
         new: dict[str, Any] = {}
         looked = False

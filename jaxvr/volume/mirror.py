@@ -18,41 +18,54 @@ from .geometry import flat_cells, signed_volumes
 _MANY = 0.25  # part of the volume at the boundary above which a mesh turned over is worth a word
 
 
+def enclosed(points: Any, cells: Any, boundary: Any, xp: Any = np) -> tuple[Any, Any]:
+    """What each face of the boundary adds to six times the volume that it encloses, as its `entry`
+    bit orients it (F,), in units of the mesh's own, and how much rounding may add to that (F,).
+
+    By Gauss's theorem the volume is the sum of det(a - o, b - o, c - o) over the faces a, b, c seen
+    from outside, wherever o is: that of a mirrored mesh is below 0, whatever its cells are. A
+    determinant errs by no more than some ulps of |a - o| |b - o| |c - o|. xp: NumPy, or jax.numpy.
+    """
+    cell = xp.clip(packing.cell_of(boundary), 0, cells.shape[0] - 1)
+    face = xp.asarray(conn.FACES)[packing.corner_of(boundary)]
+    corners = points[xp.take_along_axis(cells[cell], face, axis=1)]
+    low, high = (f(corners, (0, 1), keepdims=True) for f in (xp.min, xp.max))
+    corners = corners - 0.5 * (low + high)
+    limits = xp.finfo(points.dtype)
+    corners = corners / xp.maximum(xp.abs(corners).max(), limits.tiny)
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    outwards = (1 - 2 * packing.flag_of(boundary)).astype(points.dtype)
+    lengths = xp.sqrt(xp.sum(corners**2, axis=-1))
+    ulps = 16 * limits.eps * xp.prod(lengths, axis=-1)
+    return outwards * xp.sum(a * xp.cross(b, c), axis=-1), ulps
+
+
 def mirrored(
     points: Any, cells: Any, neighbors: Any, boundary: Any
 ) -> tuple[np.ndarray | None, str | None]:
     """The words of the boundary (F,) for moved points (P, 3), `None` if they stay, and a warning
     about cells that are turned over all the same, or `None`. The others: as in `TetMesh`.
 
-    Looks at the cells of the boundary, which are few: all components have some. Components more
-    than half of whose volume there lies the wrong way round are turned inside out. Where those at
-    the boundary are all flat, as on the sides of a lattice, they do not tell, and all cells do.
+    Components whose boundary encloses a volume below 0 are turned inside out. One-sided ones, which
+    have no inside, stay. The cells of the boundary, which are few, tell whether to look.
     """
-    points, words = np.asarray(points), np.asarray(boundary)
+    points, words = np.asarray(points, np.float64), np.asarray(boundary)
     cells, neighbors = np.asarray(cells), np.asarray(neighbors)
     if len(words) == 0:
         return None, None
     at, first = np.unique(packing.cell_of(words), return_index=True)
     outer = words[first]
     size, wrong = _wrong(points, cells[at], conn.entry_signs(outer), packing.turned_of(outer))
-    if (size > 0).all() and not wrong.any():
+    volume, error = enclosed(points, cells, words)
+    if (size > 0).all() and not wrong.any() and volume.sum() >= 0:
         return None, None
     tau, label = conn.orientations(neighbors, words)
-    blind = np.bincount(label[at], size, len(cells)) == 0
-    blind[np.setdiff1d(label, label[at])] = False  # without a boundary there is nothing to turn
-    if blind[label[at]].any():
-        more = np.flatnonzero(blind[label])
-        turned = _turned(neighbors, words)[more]
-        more_size, more_wrong = _wrong(points, cells[more], tau[more], turned)
-        at = np.concatenate([at, more])
-        size, wrong = np.concatenate([size, more_size]), np.concatenate([wrong, more_wrong])
-    if not wrong.any():
-        return None, None
-    of = label[at]
-    whole = np.bincount(of, size, len(cells))
-    inside_out = np.bincount(of, np.where(wrong, size, 0.0), len(cells)) > 0.5 * whole
-    change = inside_out[label[packing.cell_of(words)]]
-    wrong = wrong ^ (inside_out[of] & (size > 0))
+    of = label[packing.cell_of(words)]
+    volume, error = np.bincount(of, volume, len(cells)), np.bincount(of, error, len(cells))
+    inside_out = volume < -error
+    inside_out[label[tau == 0]] = False
+    change = inside_out[of]
+    wrong = wrong ^ (inside_out[label[at]] & (size > 0))
     message = None
     if size[wrong].sum() > _MANY * size.sum():
         tau = np.where(inside_out[label], -tau, tau)

@@ -227,3 +227,45 @@ def test_no_home_ends_in_a_picture_and_one_warning(folder, tmp_path):
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run(run, env=environment, cwd=root, capture_output=True, text=True)
     assert done.stdout.split() == ["1", "None"], done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("relative", ["cache", "./cache", "../cache", "~/cache", ""])
+def test_a_relative_cache_folder_is_passed_over(monkeypatch, tmp_path, relative):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", relative)
+    assert cache.default_folder() == (tmp_path / "home/.cache/jaxvr", None)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache.default_folder() == (tmp_path / "xdg/jaxvr", None)
+
+
+@pytest.mark.parametrize("home", [None, "here"])
+def test_the_working_folder_is_no_place_for_libraries(monkeypatch, tmp_path, home):
+    def nobody(*_):
+        raise KeyError("no entry")
+
+    for name in ("HOME", "LOCALAPPDATA", "XDG_CACHE_HOME", "JAXVR_CACHE", "TMPDIR", "TEMP", "TMP"):
+        monkeypatch.delenv(name, raising=False)
+    if home:
+        monkeypatch.setenv("HOME", home)
+    monkeypatch.setattr("pwd.getpwuid", nobody)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # what `tempfile` ends up with
+    with pytest.raises(FileNotFoundError):
+        cache.default_folder()
+    with pytest.raises(build.NativeError, match="neither a home folder"):
+        build.build("float32")
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # unless somebody says so
+    assert cache.default_folder()[0].parent == tmp_path
+
+
+def test_a_tilde_in_the_name_of_the_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("JAXVR_CACHE", "~/libraries")
+    assert build.cache_folder() == (tmp_path / "libraries", None)
+    monkeypatch.setenv("JAXVR_CACHE", "~nobody-of-this-name/libraries")
+    with pytest.raises(build.NativeError):
+        build.build("float32")
+    build._depends()  # nor does this let a RuntimeError out

@@ -110,6 +110,10 @@ def test_components_are_signed_one_by_one():
     # across faces 0 and 1 consistent cells have equal signs
     turned, _ = conn.combinatorial(np.array([1, -1, 1, -1, -1, 1], np.int8), pairs)
     assert turned.tolist() == [False, True, False, False, False, True]
+    # of two cells the larger one decides, of three the one that outweighs the others
+    sizes = np.array([1.0, 2.5, 1.0, 1.0, 2.0, 0.0])
+    turned, _ = conn.combinatorial(np.array([1, -1, 1, -1, -1, 1], np.int8), pairs, sizes)
+    assert turned.tolist() == [True, False, True, False, False, True]
 
 
 def test_one_sided_chain():

@@ -181,7 +181,7 @@ def test_a_flat_cell_does_not_mend_a_one_sided_ring():
     pairs = np.array([[0, 0, 1, 1], [1, 0, 2, 1], [2, 0, 0, 2]])
     sign = conn.fill_signs(np.array([1, 0, 1], np.int8), np.array([1.0, 0.0, 1.0]), pairs)
     assert sign.tolist() == [1, 1, 1]
-    turned, one_sided = conn.combinatorial(sign, pairs, np.array([False, True, False]))
+    turned, one_sided = conn.combinatorial(sign, pairs, np.array([1.0, 0.0, 1.0]))
     assert one_sided == 1 and not turned.any()
 
 
