@@ -155,7 +155,7 @@ def test_gradients_across_flat_and_overturned_cells(direction, quick_jit):
     differences to either side. Flat cells are kinks, with the derivative that ray casting takes."""
     rng = np.random.default_rng(3)
     mesh, shape = mesh_of("float64", False), shapes()
-    origins, directions = (x[:256] for x in rays_of("float64"))
+    origins, directions = (x[::4] for x in rays_of("float64"))
     shift = rng.normal(size=origins.shape)
     origins = origins + 1e-3 * shift
     move = rng.normal(size=shape.points.shape) * shape.inner[:, None]
@@ -180,11 +180,10 @@ def test_gradients_across_flat_and_overturned_cells(direction, quick_jit):
     for points in (mesh.points, jnp.asarray(flat.moved(shape))):
         ours, theirs = (g(points, mesh.values, origins) for g in (found, wanted))
         # On the outside, flat cells stay: of faces in one place, either may be the one that is met.
-        where = slice(None) if points is mesh.points else shape.inner
         for i, (a, b) in enumerate(zip(ours, theirs, strict=True)):
             scale = np.abs(b).max()
             assert scale > 0.1
-            a, b = (x[where] if i == 0 else x for x in (a, b))
+            a, b = (x[shape.inner] if i == 0 else x for x in (a, b))
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * scale)
     along = jax.jit(
         lambda h: f(points + h * move, mesh.values + h * change, origins + 0.1 * h * shift)

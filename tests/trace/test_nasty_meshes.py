@@ -23,10 +23,12 @@ PLACES = 8.0 * np.array([(k % 4, (k // 4 + 2 * k) % 5, (3 * k) % 7) for k in ran
 # The thinnest of them is 1e-4 high, and stands where coordinates are 32 and more: differences of
 # two of them are rounded by 2^-48 (in float32 it is not told from a plane, but rays agree there).
 ATOL = {"float32": None, "float64": 4 * 2.0**-48 / 1e-4}
+BOTH = ("two points", "many points")
+# A k-buffer's segments do not depend on the transfer function, and forty entries take time.
 TRACERS = {
-    "RayCast": (None, None),
-    "RayCast, loops of JAX": (None, jaxvr.Replay(native=False)),
-    "KBuffer": (jaxvr.KBuffer(k=40), None),
+    "RayCast": (None, None, BOTH),
+    "RayCast, loops of JAX": (None, jaxvr.Replay(native=False), BOTH),
+    "KBuffer": (jaxvr.KBuffer(k=40), None, BOTH[1:]),
 }
 
 
@@ -63,9 +65,9 @@ def rays(dtype: str):
 
 @pytest.mark.parametrize("tracer", TRACERS)
 def test_against_brute_force(tracer, dtype):
-    how, adjoint = TRACERS[tracer]
+    how, adjoint, names = TRACERS[tracer]
     transfers = testing.nasty_transfers(dtype=dtype)
-    for name in ("two points", "many points"):
+    for name in names:
         worst = testing.assert_render_close(
             *(everything(dtype), rays(dtype), transfers[name]),
             tracer=how,
