@@ -17,11 +17,14 @@ from jaxvr.fit.differences import CheckpointWarning
 WHAT = "The checkpoint"
 
 
-def prepare(path: Any, resume: bool) -> None:
-    """Looks at the place before anything is computed. Raises OSError if nothing can be written
-    there, ValueError if a file is there that is no checkpoint."""
+def prepare(path: Any, resume: bool) -> int:
+    """Looks at the place before anything is computed.
+
+    Gives the iterations that a fit from the start would replace. Raises OSError if nothing can be
+    written there, ValueError if a file is there that is no checkpoint.
+    """
     if path is None:
-        return
+        return 0
     try:
         place = place_of(path)
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -33,8 +36,7 @@ def prepare(path: Any, resume: bool) -> None:
         kind = OSError if isinstance(e, OSError) else ValueError
         raise kind(f"{WHAT} cannot be written to {shown(path)}: {reason}.") from e
     require_place(path, WHAT)
-    if not resume:
-        files.require_replaceable(path)
+    return 0 if resume else files.require_replaceable(path)
 
 
 class Keeper:
