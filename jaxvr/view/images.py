@@ -36,7 +36,7 @@ def psnr(a: Any, b: Any, peak: float = 1.0) -> Array:
     return psnr_of(a, b, peak)
 
 
-def psnr_of(a: Array, b: Array, peak: Any = 1.0) -> Array:
+def psnr_of(a: Any, b: Any, peak: Any = 1.0) -> Array:
     """`psnr` of floats that were looked at."""
     error = jnp.mean((a - b) ** 2)
     equal = error == 0
@@ -59,7 +59,7 @@ def ssim(a: Any, b: Any, peak: float = 1.0) -> Array:
 
 
 @jax.jit
-def ssim_of(a: Array, b: Array, peak: Any = 1.0) -> Array:
+def ssim_of(a: Any, b: Any, peak: Any = 1.0) -> Array:
     """`ssim` of images that were looked at."""
     moments = jnp.stack([a, b, a * a, b * b, a * b])
     for axis in (1, 2):

@@ -7,6 +7,7 @@ the last, the caller the second, and what the file says of itself is told where 
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 from pathlib import Path
@@ -158,10 +159,9 @@ def _npy(place: Path) -> tuple[np.ndarray, str | None, bool]:
 
 
 def _exr(place: Path) -> tuple[np.ndarray, str | None, bool]:
-    try:
+    module: Any = None
+    with contextlib.suppress(ImportError):
         module = importlib.import_module("OpenEXR")
-    except ImportError:
-        module = None
     if not hasattr(module, "File"):
         raise _Told(
             "needs the package OpenEXR, 3.3 or newer: pip install OpenEXR. "
@@ -190,8 +190,8 @@ def _pillow(place: Path) -> tuple[np.ndarray, str | None, bool]:
             raise _Told(f"holds {getattr(picture, 'n_frames')} frames. Save one of them alone.")  # noqa: B009
         coded = _coding(picture)
         transparent = picture.info.get("transparency")
-        tile = picture.tile[0] if picture.tile else None
-        way = tile[3] if tile is not None and isinstance(tile[3], str) else ""
+        tile: Any = picture.tile[0] if picture.tile else (None, None, None, "")
+        way = tile[3] if isinstance(tile[3], str) else ""
         if way.endswith(";16B") and picture.format == "PNG":
             pixels = _sixteen_bits(place, picture, way)
             if transparent is not None:

@@ -435,3 +435,11 @@ def test_seeds_are_whole_numbers(seed):
         fit_parameters(toward(TARGET), START, seed=seed)
     with pytest.raises(ValueError, match="seed must be a whole number of at least 0"):
         fit(seed=seed)
+
+
+def test_the_experiment_on_faults_finds_none():
+    """In a process of its own, since it forks."""
+    command = [sys.executable, "-m", "experiments.file_faults", "--tiny"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "kills, checkpoints" in done.stdout and "fault" not in done.stdout

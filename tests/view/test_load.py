@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -198,7 +199,8 @@ def test_what_cannot_be_a_picture_is_named(tmp_path):
     np.save(tmp_path / "a.npy", np.full((4, 4, 3), 1.5))
     with pytest.warns(PictureWarning, match="from 1.5 to 1.5, outside of 0 to 1"):
         load_image(tmp_path / "a.npy")
-    for keywords in ({"alpha": "none"}, {"srgb": "yes"}, {"background": (255, 0, 0)}):
+    mistakes: list[Any] = [{"alpha": "none"}, {"srgb": "yes"}, {"background": (255, 0, 0)}]
+    for keywords in mistakes:
         with pytest.raises(ValueError, match="must be|Divide"):
             load_image(tmp_path / "whole.png", **keywords)
 
