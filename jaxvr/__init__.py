@@ -48,7 +48,7 @@ from jaxvr.trace import (
     measure_k,
     rasterize,
 )
-from jaxvr.view import Camera, psnr, ssim
+from jaxvr.view import Camera, load_image, psnr, ssim
 from jaxvr.volume import (
     TetMesh,
     datasets,
@@ -90,6 +90,7 @@ __all__ = [
     "fit",
     "fit_parameters",
     "list_fields",
+    "load_image",
     "load_ipython_extension",
     "measure_k",
     "native",

@@ -15,9 +15,12 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxvr._core.status import RenderError
+from jaxvr._core.warn import warn
+from jaxvr._core.writing import place_of
 from jaxvr.defaults import DEPTH, default_transfer, diagonal
 from jaxvr.files import image_writer, save_image
-from jaxvr.fit import FitError, fit, noise
+from jaxvr.fit import CheckpointWarning, FitError, fit, noise
+from jaxvr.fit.resume import prepare
 from jaxvr.optics import TransferFunction
 from jaxvr.render import render
 from jaxvr.view import Camera
@@ -81,6 +84,7 @@ def picture(arguments: Any) -> None:
 
 def recover(arguments: Any) -> None:
     """Renders views with a reference transfer function, fits one to them from noise."""
+    _look_at_checkpoint(arguments)
     mesh = _mesh(arguments)
     reference = _transfer(arguments.reference_tf, mesh, arguments)
     if arguments.points < 2:
@@ -104,7 +108,7 @@ def recover(arguments: Any) -> None:
         held_out=(held_out, unseen),
         progress=None if not arguments.quiet else False,
         checkpoint=arguments.checkpoint,
-        resume=arguments.checkpoint is not None,
+        resume=arguments.resume,
         **fast_schedule(arguments.iterations),
         **look,
     )
@@ -116,6 +120,24 @@ def recover(arguments: Any) -> None:
     scores = result.report()["held_out"][0]
     psnr = "equal" if scores["psnr"] is None else f"{scores['psnr']:.2f} dB"
     print(f"held-out view: PSNR {psnr}; pictures and report.json in {out}")
+
+
+def _look_at_checkpoint(arguments: Any) -> None:
+    """Before anything is read: what stands there is gone on from only when told."""
+    path, resume = arguments.checkpoint, arguments.resume
+    if path is None and resume:
+        raise ValueError("--resume needs --checkpoint FILE, the file to go on from.")
+    if path is None:
+        return
+    done = prepare(path, resume)
+    if resume and not place_of(path).exists():
+        warn(f"There is no checkpoint {path!r} yet: the fit starts anew.", CheckpointWarning)
+    if done and not resume:
+        warn(
+            f"The checkpoint {path!r} holds {done} iterations. The fit starts anew and replaces "
+            "it; pass --resume to go on from it.",
+            CheckpointWarning,
+        )
 
 
 def fast_schedule(iterations: int) -> dict[str, Any]:
@@ -230,7 +252,8 @@ def _parser() -> argparse.ArgumentParser:
         ("seed", 0, "of the noise to start from"),
     ):
         made.add_argument(f"--{name}", type=int, default=default, metavar="N", help=about + shown)
-    made.add_argument("--checkpoint", metavar="FILE", help="written, and resumed from if it exists")
+    made.add_argument("--checkpoint", metavar="FILE", help="where the state is kept on the way")
+    made.add_argument("--resume", action="store_true", help="go on from the checkpoint's state")
     made.add_argument("--quiet", action="store_true", help="no progress bar")
     made.add_argument("-o", "--output", required=True, metavar="FOLDER", help="pictures, report")
     return parser

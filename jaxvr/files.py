@@ -24,6 +24,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxvr._core.checks import as_floats, require_finite, require_light
+from jaxvr._core.writing import beside, require_place, whole_file
 from jaxvr.render import render
 from jaxvr.view import images as _images
 from jaxvr.view.camera import Camera
@@ -34,7 +35,8 @@ _BLACK = (0.0, 0.0, 0.0)
 def save_image(
     path: str | os.PathLike[str], image: Any, background: Any = None, srgb: bool = False
 ) -> None:
-    """Writes an image (H, W, 4) or (H, W, 3) in the format that the path's suffix names.
+    """Writes an image (H, W, 4) or (H, W, 3) in the format that the path's suffix names; whole, or
+    not at all. `jaxvr.load_image` reads it back.
 
     .png: eight bits a channel, of what lies between 0 and 1. A transparent image gets straight
         alpha, as the format wants it. Bytes (uint8), as `turntable` returns them, are written as
@@ -47,7 +49,8 @@ def save_image(
       srgb: code linear light as sRGB, for .png; see the module.
 
     Raises ValueError for another suffix, for what is no image, for NaN, for `srgb` with a format of
-    floats and where OpenEXR is missing; FileNotFoundError where there is no such folder.
+    floats and where OpenEXR is missing; FileNotFoundError where there is no such folder; OSError
+    where it cannot be written.
     """
     image_writer(path)(Path(path), image, background, srgb)
 
@@ -210,13 +213,16 @@ def _writer_for(path: Any, writers: dict[str, Callable[..., Any]], what: str) ->
         raise FileNotFoundError(
             f"There is no folder {str(path.parent)!r} to write {path.name!r} in. Make it first."
         )
+    require_place(path, what)
     return write
 
 
 def _write_png(path: Path, image: Any, background: Any, srgb: bool) -> None:
     from PIL import Image
 
-    Image.fromarray(pixels(image, background, srgb)).save(path, format="PNG")
+    made = Image.fromarray(pixels(image, background, srgb))
+    with whole_file(path) as file:
+        made.save(file, format="PNG")
 
 
 def _write_npy(path: Path, image: Any, background: Any, srgb: bool) -> None:
@@ -227,7 +233,7 @@ def _write_npy(path: Path, image: Any, background: Any, srgb: bool) -> None:
         checked = _floats(image, background)
         # As it is: `_floats` may have rounded float64, where JAX has it switched off.
         image = checked if background is not None else np.asarray(image)
-    with open(path, "wb") as file:  # numpy.save would add a suffix to "A.NPY"
+    with whole_file(path) as file:
         np.save(file, image)
 
 
@@ -238,8 +244,9 @@ def _write_exr(path: Path, image: Any, background: Any, srgb: bool) -> None:
     image = np.ascontiguousarray(_floats(image, background), np.float32)
     module = _openexr()
     header = {"compression": module.ZIP_COMPRESSION, "type": module.scanlineimage}
-    with module.File(header, {"RGBA" if image.shape[-1] == 4 else "RGB": image}) as file:
-        file.write(str(path))
+    channels = {"RGBA" if image.shape[-1] == 4 else "RGB": image}
+    with beside(path) as part, module.File(header, channels) as file:
+        file.write(str(part))
 
 
 def _refuse_srgb(path: Path, srgb: bool) -> None:
@@ -296,15 +303,16 @@ def _write_gif(path: Path, movie: np.ndarray, fps: float) -> list[Path]:
     # GIF counts hundredths of a second: what one frame loses by rounding, another gets.
     ends = np.rint(100 * np.arange(len(movie) + 1) / fps).astype(int)
     durations = (10 * np.maximum(np.diff(ends), 2)).tolist()
-    images[0].save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=images[1:],
-        duration=durations,
-        loop=0,
-        optimize=False,
-    )
+    with whole_file(path) as file:
+        images[0].save(
+            file,
+            format="GIF",
+            save_all=True,
+            append_images=images[1:],
+            duration=durations,
+            loop=0,
+            optimize=False,
+        )
     return [path]
 
 
@@ -384,12 +392,14 @@ def _write_mp4(path: Path, movie: np.ndarray, fps: float) -> list[Path]:
         *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{fps:g}", "-i", "-"),
         *("-an", "-vf", "scale=out_color_matrix=bt709:out_range=tv"),
         *("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", *color.split()),
-        *("-movflags", "+faststart", str(path.absolute())),
+        *("-movflags", "+faststart"),
     ]
-    done = subprocess.run(command, input=movie.tobytes(), capture_output=True, check=False)
-    if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines() or ["nothing"]
-        raise RuntimeError(f"{command[0]} could not write {str(path)!r}. It said: {said[-1]}")
+    with beside(path) as part:
+        command.append(str(part.absolute()))
+        done = subprocess.run(command, input=movie.tobytes(), capture_output=True, check=False)
+        if done.returncode:
+            said = done.stderr.decode(errors="replace").strip().splitlines() or ["nothing"]
+            raise RuntimeError(f"{command[0]} could not write {str(path)!r}. It said: {said[-1]}")
     return [path]
 
 

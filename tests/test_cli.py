@@ -151,3 +151,25 @@ def test_python_m_jaxvr_as_users_run_it(mesh, tmp_path):
     done = run("info", "nowhere.vtu")
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.strip().splitlines() == ["jaxvr: error: There is no file 'nowhere.vtu'."]
+
+
+def test_the_command_line_resumes_only_when_told(mesh, tf, tmp_path, capsys):
+    kept = tmp_path / "c.npz"
+    begin = ["fit", mesh, "--reference-tf", tf, "-o", str(tmp_path / "f"), "--quiet"]
+    begin += ["--points", "4", "--views", "1", "--iterations", "2", "--size", "8"]
+    begin += ["--checkpoint", str(kept)]
+    assert main(begin) == 0
+    assert capsys.readouterr().err == ""
+    kept.write_bytes(kept.read_bytes()[:-30])
+    assert main([*begin, "--resume"]) == 2
+    assert "c.npz' is no checkpoint of a fit" in capsys.readouterr().err
+    kept.unlink()
+    assert main([*begin, "--resume"]) == 0
+    assert "There is no checkpoint" in capsys.readouterr().err
+    assert main(begin) == 0
+    told = capsys.readouterr().err
+    assert "holds 2 iterations. The fit starts anew and replaces it; pass --resume" in told
+    assert main([*begin, "--seed", "1", "--resume"]) == 2
+    assert "belongs to another fit: seed was 0 and is 1" in capsys.readouterr().err
+    assert main([*begin[:-2], "--resume"]) == 2
+    assert "--resume needs --checkpoint FILE" in capsys.readouterr().err

@@ -72,6 +72,23 @@ def require_kind(name: str, x: Any, kind: type, hint: str = "") -> None:
         raise ValueError(f"{what} {hint}".rstrip())
 
 
+def refuse_bytes(name: str, x: Any, hint: str = "") -> None:
+    """ValueError for a picture of integers or booleans: in floats 255 would be 255 times white."""
+    dtype = getattr(x, "dtype", None)
+    if dtype is None:
+        try:
+            dtype = np.asarray(x).dtype
+        except Exception:
+            return  # said by whoever reads it
+    if np.dtype(dtype).kind in "iub":
+        most = {1: 255, 2: 65535}.get(np.dtype(dtype).itemsize, 255)
+        what = (
+            f"{name} has dtype {dtype}, but pictures are floats, linear light from 0 to 1. Read "
+            f"files with jaxvr.load_image, or divide by {most}."
+        )
+        raise ValueError(f"{what} {hint}".rstrip())
+
+
 def require_light(name: str, x: Any) -> None:
     """ValueError for colours with NaN or infinite entries, and for bytes, which `BRIGHTEST` tells
     from light (if concrete)."""

@@ -13,6 +13,7 @@ traced once and shaded at every iteration.
 To add a transform, write a pytree with `to_value` and `to_raw`; to add a loss, pass a function.
 """
 
+from jaxvr.fit.differences import CheckpointWarning
 from jaxvr.fit.fit import fit
 from jaxvr.fit.loop import FitError, LoopResult, fit_parameters
 from jaxvr.fit.losses import l1, l2, smoothness
@@ -20,6 +21,7 @@ from jaxvr.fit.parameters import Ordered, Parameters, Sigmoid, Softplus, noise
 from jaxvr.fit.report import FitResult
 
 __all__ = [
+    "CheckpointWarning",
     "FitError",
     "FitResult",
     "LoopResult",

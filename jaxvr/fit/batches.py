@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvr._core.checks import as_floats, require_finite
 from jaxvr._core.pytree import pytree
+from jaxvr.fit.targets import images_of
 from jaxvr.render import trace
 from jaxvr.trace import Segments
 from jaxvr.view.camera import Camera
@@ -93,8 +93,8 @@ def gather_views(
     background: Any,
 ) -> Views:
     """Checked views: cameras with targets, traced if `cache`. Raises ValueError."""
-    images = _images(targets, cameras, background)
     shapes = [_shape(c) for c in cameras]
+    images = images_of(targets, shapes, background)
     flat = np.concatenate([x.reshape(-1, x.shape[-1]) for x in images])
     traced = [isinstance(c, Segments) for c in cameras]
     if any(traced) and not cache:
@@ -281,38 +281,3 @@ def _shape(camera: Any) -> tuple[int, int]:
         return camera.height, camera.width
     height, width = camera.shape
     return height, width
-
-
-def pictures_of(targets: Any) -> list[Any]:
-    """Targets as a list; one alone is a list of one."""
-    if getattr(targets, "ndim", None) == 3:
-        return [targets]
-    try:
-        return list(targets)
-    except TypeError:
-        raise ValueError(f"targets must be images, not {type(targets).__name__}.") from None
-
-
-def _images(targets: list[Any], cameras: list[Any], background: Any) -> list[np.ndarray]:
-    number = len(targets)
-    if number != len(cameras):
-        raise ValueError(f"There are {len(cameras)} cameras, but {number} targets.")
-    out = []
-    for k, (image, camera) in enumerate(zip(targets, cameras, strict=True)):
-        image = np.asarray(as_floats(f"targets[{k}]", image))
-        want = _shape(camera)
-        if image.ndim != 3 or image.shape[:2] != want or image.shape[2] not in (3, 4):
-            raise ValueError(
-                f"targets[{k}] must have shape {(*want, 4)} as its camera has, "
-                f"or {(*want, 3)}, but has {image.shape}."
-            )
-        require_finite(f"targets[{k}]", image)
-        out.append(image)
-    channels = {x.shape[2] for x in out}
-    if len(channels) > 1:
-        raise ValueError("Some targets are RGBA and some RGB. Pass one kind.")
-    if channels == {3} and background is None:
-        raise ValueError(
-            "Targets without alpha need background=, the colour (3,) that they were made on."
-        )
-    return out

@@ -34,12 +34,14 @@ from jaxvr.arguments import (
 )
 from jaxvr.composite import Over
 from jaxvr.defaults import diagonal
-from jaxvr.fit.batches import Batch, Views, deal, gather_views, listed, make_batches, pictures_of
-from jaxvr.fit.loop import Control, batch_number, run
+from jaxvr.fit.batches import Batch, Views, deal, gather_views, listed, make_batches
+from jaxvr.fit.belongs import belongs
+from jaxvr.fit.loop import Control, batch_number, prepare, run
 from jaxvr.fit.losses import loss_of
 from jaxvr.fit.losses import smoothness as roughness
 from jaxvr.fit.parameters import Parameters
 from jaxvr.fit.report import FitResult, likeness, number, timing
+from jaxvr.fit.targets import look_at_targets, pictures_of
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.render import render_rays, shade
 from jaxvr.trace import AbstractTracer, Recorded, Segments
@@ -86,8 +88,8 @@ def fit(
       volume: a `TetMesh`; None if all cameras are `Segments`.
       cameras: one or more `Camera`s, or `Segments` that `trace` gave for them (for several fits of
         the same views). Sizes may differ.
-      targets: a picture for each camera, (height, width, 4) premultiplied linear RGBA, or
-        (height, width, 3) on an opaque `background`.
+      targets: a picture for each camera, (height, width, 4) premultiplied linear RGBA floats, or
+        (height, width, 3) on an opaque `background`; `jaxvr.load_image` reads them from files.
       free: which fields move: names among "colors", "extinctions", "positions", or a dict from
         names to transforms; see `jaxvr.fit.parameters`. Colours then lie in [0, 1], extinctions
         are >= 0, positions stay sorted and between the first and the last.
@@ -107,7 +109,10 @@ def fit(
       cache: trace each view once and shade after, with 8 bytes of memory a segment (16 in
         float64). False renders at every iteration.
       held_out: (cameras, targets) that only the report looks at.
-      progress, patience, tolerance, checkpoint, checkpoint_every, resume: as `fit_parameters`.
+      progress, patience, tolerance, checkpoint, checkpoint_every, resume: as `fit_parameters`. What
+        a checkpoint belongs to: the volume, the cameras, the targets, the start, what is free and
+        its transforms, loss, smoothness, optimiser, background, seed, minibatches, cache, dtype,
+        tracer, integrator, compositor, adjoint, and all of it as one traced program.
       callback: called after every step with (iteration, loss, transfer); True ends the fit.
       tracer, integrator, compositor, adjoint: as `render`.
 
@@ -115,16 +120,22 @@ def fit(
       FitResult: transfer, loss_history, images, report(), save(folder).
 
     Raises:
-      ValueError: for arguments that do not fit each other. FitError: if the loss becomes NaN or
-        infinite. RenderError: if a ray could not be followed.
+      ValueError: for arguments that do not fit each other, targets of bytes, a checkpoint of
+        another fit or none. FitError: if the loss becomes NaN or infinite. OSError: if no
+        checkpoint can be written. RenderError: if a ray could not be followed.
 
-    Warns with a `jaxvr.ViewWarning` of cameras that do not see the volume, and of control points
-    that do not lie where its field does.
+    Warns with a `jaxvr.ViewWarning` of cameras that do not see the volume, of control points that
+    do not lie where its field does, and of targets that no picture can reach; of checkpoints as
+    `fit_parameters`.
     """
     require_kind("transfer", transfer, TransferFunction)
     nouns = integrator_of(integrator), compositor_of(compositor), adjoint_of(adjoint)
     nouns = (*nouns, tracer_of(tracer))
     begin = time.perf_counter()
+    control = Control(
+        *(iterations, seed, progress, patience, tolerance, checkpoint, checkpoint_every, resume)
+    ).checked()
+    prepare(control)
     background = background_of(background)
     cameras, targets = listed(cameras), pictures_of(targets)
     number_seen = len(cameras)
@@ -143,6 +154,7 @@ def fit(
     # A length to measure extinctions by, where the start has none.
     size = max(float(c.length.max()) for c in cameras) if volume is None else diagonal(volume)
     parameters = Parameters.of(transfer.astype(dtype), free, size)
+    look_at_targets(seen.split(seen.targets), parameters, background)
     dealt = deal(seen, rays, views, seed)
     batches, places = make_batches(seen, dealt)
     objective = Objective(loss_of(loss), *_settled(nouns, dtype, cache))
@@ -163,10 +175,15 @@ def fit(
         return callback(iteration, value, transfer_of(parameters, raw))
 
     prepared = time.perf_counter() - begin
-    control = Control(
-        *(iterations, seed, progress, patience, tolerance, checkpoint, checkpoint_every, resume)
-    )
     named = {"free": list(parameters.transforms), "rays": len(places[0]), "loss": _name(loss)}
+    about = belongs(
+        {"verb": "fit", "cache": bool(cache), "dtype": str(dtype)} | named,
+        objective,
+        (integrator_of(integrator), compositor_of(compositor), adjoint_of(adjoint)),
+        (volume, cameras[:number_seen], seen),
+        (parameters, background),
+        weights,
+    )
     result = run(
         objective.gradient,
         parameters.raw(),
@@ -176,7 +193,7 @@ def fit(
         learning_rate,
         control,
         told if callback is not None else None,
-        named,
+        about,
     )
     fitted = jax.tree.map(np.asarray, transfer_of(parameters, result.parameters))
     fitted = TransferFunction(fitted.positions, fitted.colors, fitted.extinctions)

@@ -11,7 +11,6 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,7 +20,8 @@ import optax
 from tqdm import tqdm
 
 from jaxvr._core.status import check
-from jaxvr.fit import checkpoint as files
+from jaxvr.fit import digest, resume
+from jaxvr.fit.differences import environment
 
 
 class FitError(RuntimeError):
@@ -77,6 +77,9 @@ class Control:
             raise ValueError(f"tolerance must lie in [0, 1), but is {self.tolerance!r}.")
         if self.resume and self.checkpoint is None:
             raise ValueError("resume=True needs checkpoint=, the file to resume from.")
+        seed = self.seed
+        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+            raise ValueError(f"seed must be a whole number of at least 0, but is {seed!r}.")
         return self
 
 
@@ -114,17 +117,28 @@ def fit_parameters(
         the fit ends there.
       patience, tolerance: end when the mean loss of an epoch has not fallen below (1 - tolerance)
         times its earlier minimum for `patience` iterations.
-      checkpoint: a file written every `checkpoint_every` iterations and at the end.
+      checkpoint: a file written every `checkpoint_every` iterations and at the end, whole or not at
+        all. What is there is replaced if it is a checkpoint. The place is tried before the first
+        step; failures to write are warnings after that.
       resume: go on from that file if it exists: the result is that of a fit that never stopped,
-        to the bit, with the same other arguments (`iterations` counts all).
+        to the bit, with the same other arguments (`iterations` counts all) on the same machine.
+        Other ones are refused: the file holds digests of the start and the batches, and of the loss
+        and the optimiser as JAX traces them, with all numbers and arrays in them. What a loss calls
+        back in Python (`jax.pure_callback`) counts by its name. Loss and optimiser cannot be
+        compared between versions of JAX or machines; then a warning says so.
 
     Raises:
       FitError: when loss or gradient are not finite, with the iteration. ValueError: for arguments
-        out of range, parameters that are no floats, and a checkpoint of another fit.
+        out of range, parameters that are no floats, a checkpoint of another fit, and a file that is
+        no whole checkpoint. OSError: for a place where no checkpoint can be written.
+
+    Warns with a `jaxvr.fit.CheckpointWarning` of a checkpoint that could not be written, that holds
+    more iterations than are asked for, or that was made by other versions or elsewhere.
     """
     control = Control(
         *(iterations, seed, progress, patience, tolerance, checkpoint, checkpoint_every, resume)
-    )
+    ).checked()
+    prepare(control)
     parameters = jax.tree.map(jnp.asarray, parameters)
     leaves = jax.tree.leaves(parameters)
     if not leaves or not all(jnp.issubdtype(x.dtype, jnp.floating) for x in leaves):
@@ -141,7 +155,18 @@ def fit_parameters(
     def inputs(iteration: int) -> tuple[Any, ...]:
         return () if batches is None else (batches[batch_number(iteration, count, seed)],)
 
-    return run(gradient, parameters, inputs, count, optimizer, learning_rate, control, callback, {})
+    def about(_: int) -> dict[str, Any]:
+        digests = {"parameters": digest.data(parameters), "batches": digest.data(batches)}
+        return {"verb": "fit_parameters", "digests": digests}
+
+    return run(
+        gradient, parameters, inputs, count, optimizer, learning_rate, control, callback, about
+    )
+
+
+def prepare(control: Control) -> None:
+    """Looks at the checkpoint's place before anything is computed; raises what is wrong with it."""
+    resume.prepare(control.checkpoint, control.resume)
 
 
 def run(
@@ -153,10 +178,13 @@ def run(
     learning_rate: Any,
     control: Control,
     callback: Any,
-    settings: dict[str, Any],
+    about: Callable[[int], dict[str, Any]],
 ) -> LoopResult:
-    """The loop. `gradient(parameters, *inputs(i))` is ((loss, status bits), gradient), compiled."""
-    control = control.checked()
+    """The loop. `gradient(parameters, *inputs(i))` is ((loss, status bits), gradient), compiled.
+
+    control: checked, its place prepared. about: from a number of iterations to what the state after
+    them belongs to, beside the seed and the programs of gradient and optimiser.
+    """
     optimizer = adam(learning_rate) if optimizer is None else optimizer
     if not (hasattr(optimizer, "init") and hasattr(optimizer, "update")):
         raise ValueError(
@@ -165,11 +193,25 @@ def run(
     update = _update_of(optimizer)
     state = parameters, optimizer.init(parameters)
     losses: list[float] = []
-    settings = {"seed": int(control.seed), "batches": epoch} | settings
-    if control.resume and Path(control.checkpoint).exists():
-        state, losses = files.load(control.checkpoint, state, settings)
+    start = state
+
+    @functools.cache
+    def programs() -> dict[str, str]:
+        optimizing = digest.data([digest.program(update, *start, start[0]), start[1]])
+        whole = digest.program(gradient, start[0], *inputs(0))
+        return {"the optimiser": optimizing, "the program of the loss": whole}
+
+    def belongs(done: int) -> dict[str, Any]:
+        given = about(done)
+        shown = {"seed": int(control.seed), "batches in an epoch": epoch}
+        more = {"programs": given.get("programs", {}) | programs()}
+        return shown | {"environment": environment()} | given | more
+
+    keeper = resume.Keeper(control.checkpoint, control.checkpoint_every, belongs)
+    if control.resume:
+        state, losses = keeper.restored(state, control.iterations)
     seconds: list[float] = []
-    stopped, saved = "iterations", len(losses)
+    stopped = "iterations"
     with tqdm(
         total=control.iterations,
         initial=min(len(losses), control.iterations),
@@ -193,14 +235,11 @@ def run(
             seconds.append(time.perf_counter() - begin)
             bar.set_postfix_str(f"loss {value:.3g}", refresh=False)
             bar.update()
-            if control.checkpoint is not None and (i + 1) % control.checkpoint_every == 0:
-                files.save(control.checkpoint, state, losses, settings)
-                saved = i + 1
+            keeper.step(state, losses)
             if callback is not None and callback(i, value, state[0]):
                 stopped = "callback"
                 break
-    if control.checkpoint is not None and saved != len(losses):
-        files.save(control.checkpoint, state, losses, settings)
+    keeper.end(state, losses)
     return LoopResult(state[0], np.asarray(losses), np.asarray(seconds), stopped)
 
 

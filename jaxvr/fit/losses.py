@@ -12,18 +12,28 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 
+from jaxvr._core.checks import refuse_bytes
+
 Array = jax.Array
 Loss = Callable[[Array, Array], Array]
 
 
 def l1(predicted: Array, target: Array) -> Array:
-    """Mean absolute difference (); its derivative is 0 where the two agree exactly."""
+    """Mean absolute difference (); its derivative is 0 where the two agree exactly. Bytes are a
+    ValueError: their differences wrap round."""
+    _require_floats(predicted, target)
     return jnp.mean(jnp.abs(predicted - target))
 
 
 def l2(predicted: Array, target: Array) -> Array:
-    """Mean squared difference ()."""
+    """Mean squared difference (). Bytes are a ValueError, as for `l1`."""
+    _require_floats(predicted, target)
     return jnp.mean((predicted - target) ** 2)
+
+
+def _require_floats(predicted: Any, target: Any) -> None:
+    refuse_bytes("predicted", predicted)
+    refuse_bytes("target", target)
 
 
 def smoothness(x: Array) -> Array:

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from jaxvr._core import svg
+from jaxvr._core.writing import whole_file, write_whole
 from jaxvr.fit.loop import LoopResult
 from jaxvr.optics.transfer import TransferFunction
-from jaxvr.view.images import psnr, ssim
+from jaxvr.view.images import psnr_of, ssim_of
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,14 +65,15 @@ class FitResult:
 
     def save(self, folder: Any) -> Path:
         """Writes transfer.json, report.json and images.npz (view0, ..., held_out0, ...) to a
-        `folder`, which is made if need be. Returns its path."""
+        `folder`, which is made if need be; each is whole or not there. Returns its path."""
         path = Path(folder)
         path.mkdir(parents=True, exist_ok=True)
         self.transfer.to_json(path / "transfer.json")
-        (path / "report.json").write_text(json.dumps(self.numbers, indent=2) + "\n")
+        write_whole(path / "report.json", json.dumps(self.numbers, indent=2) + "\n")
         pictures = {f"view{k}": x for k, x in enumerate(self.images)}
         pictures |= {f"held_out{k}": x for k, x in enumerate(self.held_out_images)}
-        np.savez_compressed(path / "images.npz", **pictures)  # type: ignore[arg-type]
+        with whole_file(path / "images.npz") as file:
+            np.savez_compressed(file, **pictures)  # type: ignore[arg-type]
         return path
 
 
@@ -87,8 +89,8 @@ def likeness(images: list[np.ndarray], targets: list[np.ndarray]) -> list[dict[s
     out = []
     for image, target in zip(images, targets, strict=True):
         image = image[..., : target.shape[-1]]
-        structure = None if min(target.shape[:2]) < 11 else number(ssim(image, target))
-        out.append({"psnr": number(psnr(image, target)), "ssim": structure})
+        structure = None if min(target.shape[:2]) < 11 else number(ssim_of(image, target))
+        out.append({"psnr": number(psnr_of(image, target)), "ssim": structure})
     return out
 
 

@@ -6,12 +6,13 @@ jaxvr's format holds each number with as many digits as give the same float back
      "positions": [K], "colors": [[3], K times], "extinctions": [K]}
 
 ParaView exports a list of colour maps, each with "RGBPoints" (x, r, g, b, ...), "ColorSpace" (RGB,
-HSV, Lab, Diverging or Step) and perhaps "Points" (x, opacity, midpoint, sharpness, ...), read here
-as vtkColorTransferFunction and vtkPiecewiseFunction interpret them (`sample_curves`, which serves
-`transfer_vtk` too). All nodes of both become
-control points, so nothing between two colour nodes is lost; where ParaView's curve is not linear in
-RGB and opacity, control points are added between the nodes. "NanColor" is ignored, since scalars
-are finite, and so are "IndexedColors" beside "RGBPoints".
+HSV, Lab or CIELAB, Diverging, Step), and perhaps "Points" (x, opacity, midpoint, sharpness, ...),
+"UseLogScale" (both curves over the logarithm of x), read here as vtkColorTransferFunction and
+vtkPiecewiseFunction interpret them (`sample_curves`, which serves `transfer_vtk` too). All nodes of
+both become control points, so nothing between two colour nodes is lost; where ParaView's curve is
+not linear in RGB and opacity, control points are added between the nodes. Not read are "NanColor"
+and "NanOpacity", since scalars are finite (a mesh with NaN is refused), "Discretize", and
+"IndexedColors" beside "RGBPoints"; colours for values out of range give a warning.
 
 Two departures from VTK 9.7: a sharpness of 1 is piecewise constant, as VTK's documentation has it,
 and not merely steep; and where the hues of a diverging map lie more than half a circle apart, the
@@ -22,17 +23,23 @@ from __future__ import annotations
 
 import json
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxvr._core.checks import BRIGHTEST
+from jaxvr._core.warn import warn
+from jaxvr._core.writing import place_of, shown, write_whole
 from jaxvr.optics import colormaps
 
 if TYPE_CHECKING:
     from jaxvr.optics.transfer import TransferFunction
 
 FORMAT = "jaxvr.TransferFunction"
+_KEYS = {"format", "version", "dtype", "positions", "colors", "extinctions", "brightest"}
+_READ = ("RGBPoints", "Points", "ColorSpace", "HSVWrap", "UseLogScale", "IndexedColors", "Name")
+# What ParaView calls the colour spaces of `colormaps.SPACES`.
+_SPACES = {"CIELAB": "Lab", "LAB": "Lab", "Rgb": "RGB", "Hsv": "HSV"}
 
 
 def write(tf: TransferFunction, path: str | os.PathLike[str] | None = None) -> str:
@@ -45,9 +52,12 @@ def write(tf: TransferFunction, path: str | os.PathLike[str] | None = None) -> s
         "colors": np.asarray(tf.colors, np.float64).tolist(),
         "extinctions": np.asarray(tf.extinctions, np.float64).tolist(),
     }
+    brightest = max(map(max, document["colors"]))
+    if brightest > BRIGHTEST:  # or `read` would take them for bytes
+        document["brightest"] = brightest
     text = json.dumps(document, allow_nan=False) + "\n"
     if path is not None:
-        Path(path).write_text(text, encoding="utf-8")
+        write_whole(path, text)
     return text
 
 
@@ -84,7 +94,13 @@ def read(
     entry = _choose(document, name)
     nodes, space = _color_nodes(entry)
     curve = _opacity_nodes(entry, nodes[:, 0])
-    positions, colors, opacities = sample_curves(nodes, space, curve, points, dtype)
+    log = _flag(entry, "UseLogScale")
+    for key, rows in (("RGBPoints", nodes), ("Points", curve)):
+        if log and rows[0, 0] <= 0:
+            raise ValueError(
+                f"UseLogScale needs positions above 0, but {key!r} begins at {rows[0, 0]:g}."
+            )
+    positions, colors, opacities = sample_curves(nodes, space, curve, points, dtype, log)
     if srgb:
         colors = colormaps.srgb_to_linear(colors)
     make = _transfer_class().from_opacity
@@ -106,17 +122,44 @@ def _load(source: Any) -> Any:
     if isinstance(source, str) and source.lstrip()[:1] in ("{", "["):
         text = source
     else:
-        where = str(source)
+        where = shown(source)
         try:
-            text = Path(source).read_text(encoding="utf-8")
+            place = place_of(source)
+            if place.exists() and not place.is_file():
+                raise OSError("it is no file")
+            text = place.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as e:
             raise ValueError(f"{where} is not a text file: {e}") from e
         except (OSError, ValueError) as e:
-            raise ValueError(f"{where!r} is neither JSON text nor a readable file: {e}") from e
+            raise ValueError(f"{where} is neither JSON text nor a readable file: {e}") from e
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_once)
     except (ValueError, RecursionError) as e:
         raise ValueError(f"{where} is not valid JSON: {e}") from e
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object whose names stand there once each; of two, one would be lost in silence."""
+    made = dict(pairs)
+    if len(made) != len(pairs):
+        twice = sorted({k for k, _ in pairs if [n for n, _ in pairs].count(k) > 1})
+        raise ValueError(f"{', '.join(map(repr, twice))} stands there twice")
+    return made
+
+
+def _require_light(key: str, colors: np.ndarray, most: float) -> None:
+    if colors.size and (colors.max() > most or colors.min() < -BRIGHTEST):
+        raise ValueError(
+            f"The colours of {key!r} reach from {colors.min():g} to {colors.max():g}, but 1 is "
+            "full intensity. Divide 8-bit colours by 255."
+        )
+
+
+def _flag(entry: dict[str, Any], key: str) -> bool:
+    value = entry.get(key, False)
+    if value not in (True, False, None):
+        raise ValueError(f"{key!r} must be true or false, but is {value!r}.")
+    return bool(value)
 
 
 def _own(document: dict[str, Any], dtype: Any) -> TransferFunction:
@@ -128,7 +171,14 @@ def _own(document: dict[str, Any], dtype: Any) -> TransferFunction:
     stored = document.get("dtype", "float64")
     if stored not in ("float32", "float64"):
         raise ValueError(f"dtype must be 'float32' or 'float64', but is {stored!r}.")
+    if unknown := sorted(map(str, set(document) - _KEYS)):
+        raise ValueError(f"{unknown} are not known; a transfer function has {sorted(_KEYS)}.")
     arrays = [_numbers(document, key) for key in ("positions", "colors", "extinctions")]
+    whole = np.asarray(document["colors"]).dtype.kind in "iu"
+    stated = document.get("brightest", 0)
+    if isinstance(stated, bool) or not isinstance(stated, int | float):
+        raise ValueError(f"'brightest' must be a number, but is {stated!r}.")
+    _require_light("colors", arrays[1], 1 if whole else max(BRIGHTEST, stated))
     return _transfer_class()(*arrays, dtype=stored if dtype is None else dtype)
 
 
@@ -167,14 +217,33 @@ def _color_nodes(entry: dict[str, Any]) -> tuple[np.ndarray, str]:
         if "IndexedColors" in entry:
             raise ValueError("This colour map is categorical (IndexedColors): it has no positions.")
         raise ValueError(f"'RGBPoints' is missing; there are {sorted(map(str, entry))}.")
+    _look(entry)
     nodes = _quadruples(entry, "RGBPoints")
+    # Display colours: above 1 there is none, but for rounding.
+    if nodes[:, 1:].max() > 1 + 1e-3 or nodes[:, 1:].min() < -1e-3:
+        _require_light("RGBPoints", nodes[:, 1:], -np.inf)
     space = entry.get("ColorSpace", "RGB")
-    if space == "HSV" and entry.get("HSVWrap", False):
+    space = _SPACES.get(space, space) if isinstance(space, str) else space
+    if space == "HSV" and _flag(entry, "HSVWrap"):
         space = "HSVWrap"
     if not isinstance(space, str) or space not in colormaps.SPACES:
         known = ", ".join(colormaps.SPACES)
-        raise ValueError(f"ColorSpace {space!r} cannot be read, only {known}.")
+        raise ValueError(
+            f"ColorSpace {space!r} cannot be read, only {known}. Where VTK is at hand, "
+            "TransferFunction.from_vtk reads what it has made of it."
+        )
     return np.column_stack([nodes, np.full(len(nodes), 0.5), np.zeros(len(nodes))]), space
+
+
+def _look(entry: dict[str, Any]) -> None:
+    """Warns of what is not read although it changes the picture."""
+    for key in ("UseAboveRangeColor", "UseBelowRangeColor"):
+        if _flag(entry, key):
+            warn(f"{key} is not read: outside of its nodes a map keeps its ends.", UserWarning)
+    for key in entry:
+        near = [k for k in _READ if k.lower() == str(key).lower() and k != key]
+        if near and near[0] not in entry:
+            warn(f"{key!r} is not read; ParaView's name is {near[0]!r}.", UserWarning)
 
 
 def _opacity_nodes(entry: dict[str, Any], nodes: np.ndarray) -> np.ndarray:
@@ -198,22 +267,31 @@ def _quadruples(entry: dict[str, Any], key: str) -> np.ndarray:
 
 
 def sample_curves(
-    nodes: np.ndarray, space: str, curve: np.ndarray, points: int, dtype: Any
+    nodes: np.ndarray,
+    space: str,
+    curve: np.ndarray,
+    points: int,
+    dtype: Any,
+    logarithmic: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Control points that follow both curves: positions, colours, opacities.
 
     nodes (n, 6): x, r, g, b, midpoint, sharpness of vtkColorTransferFunction; space: of `SPACES`.
     curve (m, 4): x, opacity, midpoint, sharpness of vtkPiecewiseFunction. Both ascend by x, and two
-    nodes at one x are a jump. points, dtype: as in `read`.
+    nodes at one x are a jump. points, dtype: as in `read`. logarithmic: the curves are those over
+    log10(x), with all x above 0.
     """
     nodes, curve = _bounded(nodes), _bounded(curve)
+    places = np.unique(np.concatenate([nodes[:, 0], curve[:, 0]]))
+    if logarithmic:
+        nodes[:, 0], curve[:, 0] = np.log10(nodes[:, 0]), np.log10(curve[:, 0])
     at, curved = [], []  # control points, and intervals that straight lines would not follow
     for rows, mixing in ((nodes, space), (curve, "RGB")):
         x, mid, sharp = rows[:-1, 0], rows[:-1, -2], rows[:-1, -1]
         following = rows[1:, 0]
         middle = x + mid * (following - x)
         bends = (sharp >= 0.01) & (sharp <= 0.99)
-        bends |= (sharp < 0.01) & (mixing not in ("RGB", "Step"))
+        bends |= (sharp < 0.01) & (mixing not in (("Step",) if logarithmic else ("RGB", "Step")))
         broken = (mid != 0.5) | (sharp >= 0.01) | (mixing == "Diverging")  # at the middle
         at += [rows[:, 0], middle[broken]]
         for k in np.flatnonzero(bends & (following > x)):
@@ -232,6 +310,8 @@ def sample_curves(
     jumps = np.abs(both[0] - both[1]).max(axis=1) > 1e-12
     values = np.concatenate([both[0][jumps], both[1]])
     positions = np.concatenate([grid[jumps], grid])
+    if logarithmic:
+        positions = _powers(positions, places)
     order = np.argsort(positions, kind="stable")  # at a jump the lower side comes first
     positions, values = positions[order].astype(_float(dtype)), values[order]
     # Rounded to float32, neighbours may have become equal: a run keeps its first and its last.
@@ -239,6 +319,13 @@ def sample_curves(
     inner = run & np.concatenate([run[1:], [False]])
     positions, values = positions[~inner], values[~inner]
     return positions, values[:, :3], np.clip(values[:, 3], 0, 1)  # clips rounding only
+
+
+def _powers(exponents: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """10^exponents, and `places` themselves, ascending, where an exponent is their logarithm."""
+    logs = np.log10(places)
+    at = np.clip(np.searchsorted(logs, exponents), 0, len(logs) - 1)
+    return np.where(logs[at] == exponents, places[at], 10.0**exponents)
 
 
 def _float(dtype: Any) -> np.dtype:

@@ -17,11 +17,14 @@ from jaxvr.view.images import (
     to_uint8,
     unpremultiply,
 )
+from jaxvr.view.load import PictureWarning, load_image
 
 __all__ = [
     "Camera",
+    "PictureWarning",
     "composite_over",
     "linear_to_srgb",
+    "load_image",
     "psnr",
     "srgb_to_linear",
     "ssim",

@@ -12,7 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvr._core.checks import as_floats, is_concrete, require_finite
+from jaxvr._core.checks import (
+    BRIGHTEST,
+    as_floats,
+    is_concrete,
+    refuse_bytes,
+    require_finite,
+)
 
 Array = jax.Array
 
@@ -22,9 +28,16 @@ def psnr(a: Any, b: Any, peak: float = 1.0) -> Array:
     difference).
 
     The mean is over all entries, alpha included if there is one. Equal images give +inf, with a
-    derivative of zero. Raises ValueError for different shapes and for empty images.
+    derivative of zero. peak: full intensity; 255 for two images of bytes. Raises ValueError for
+    different shapes, empty images, and bytes or numbers above ten times the peak where it is not
+    said. (Noise may well lead a little below 0 or above the peak.)
     """
-    a, b = _pair(a, b)
+    a, b = _pair(a, b, peak)
+    return psnr_of(a, b, peak)
+
+
+def psnr_of(a: Any, b: Any, peak: Any = 1.0) -> Array:
+    """`psnr` of floats that were looked at."""
     error = jnp.mean((a - b) ** 2)
     equal = error == 0
     return jnp.where(equal, jnp.inf, -10 * jnp.log10(jnp.where(equal, 1, error / peak**2)))
@@ -37,16 +50,17 @@ def ssim(a: Any, b: Any, peak: float = 1.0) -> Array:
     an 11 x 11 Gaussian window of standard deviation 1.5 pixels, weights summing to one and so
     without Bessel's correction, K1 = 0.01, K2 = 0.03, only windows that lie inside the picture.
     `a` and `b` are (H, W) or (H, W, C), both sides at least 11, else ValueError. peak: what is full
-    intensity.
+    intensity, as for `psnr`.
     """
-    a, b = _pair(a, b)
+    a, b = _pair(a, b, peak)
     if a.ndim not in (2, 3) or min(a.shape[:2]) < 11:
         raise ValueError(f"ssim needs (H, W) or (H, W, C) with H, W >= 11, but got {a.shape}.")
-    return _ssim(a, b, peak)
+    return ssim_of(a, b, peak)
 
 
 @jax.jit
-def _ssim(a: Array, b: Array, peak: Any) -> Array:
+def ssim_of(a: Any, b: Any, peak: Any = 1.0) -> Array:
+    """`ssim` of images that were looked at."""
     moments = jnp.stack([a, b, a * a, b * b, a * b])
     for axis in (1, 2):
         moments = _blur(moments, axis)
@@ -74,6 +88,7 @@ def composite_over(image: Any, background: Any) -> Array:
     `background`: linear RGB (3,), opaque; premultiplied RGBA (4,); or an image of either kind that
     broadcasts against `image`. The result (..., 4) is premultiplied too.
     """
+    refuse_bytes("image", image)
     image = as_floats("image", image)
     back = as_floats("background", background, dtype=image.dtype)
     if image.ndim == 0 or image.shape[-1] != 4:
@@ -95,6 +110,7 @@ def unpremultiply(image: Any) -> Array:
 
     The derivative at alpha = 0 is zero.
     """
+    refuse_bytes("image", image)
     image = jnp.asarray(as_floats("image", image))
     if image.ndim == 0 or image.shape[-1] != 4:
         raise ValueError(f"image must be RGBA, shape (..., 4), but has {image.shape}.")
@@ -109,6 +125,7 @@ def linear_to_srgb(x: Any) -> Array:
 
     Negative numbers lie on the linear piece. Linear light 0 to 1 becomes 0 to 1.
     """
+    _refuse_byte_codes(x)
     x = jnp.asarray(as_floats("x", x))
     dark = x <= 0.0031308
     power = jnp.where(dark, 1, x) ** (1 / 2.4)
@@ -117,6 +134,7 @@ def linear_to_srgb(x: Any) -> Array:
 
 def srgb_to_linear(x: Any) -> Array:
     """The inverse of `linear_to_srgb`."""
+    _refuse_byte_codes(x)
     x = jnp.asarray(as_floats("x", x))
     dark = x <= 0.04045
     power = ((jnp.where(dark, 1, x) + 0.055) / 1.055) ** 2.4
@@ -127,20 +145,34 @@ def to_uint8(image: Any, srgb: bool = False) -> np.ndarray:
     """Bytes, same shape: 0 to 1 becomes 0 to 255, rounded to nearest, clipped outside.
 
     `srgb` codes linear light for display first (of four channels the first three). The colours are
-    taken as they are: `unpremultiply` first where straight alpha is wanted. NaN is a ValueError.
+    taken as they are: `unpremultiply` first where straight alpha is wanted. NaN is a ValueError,
+    and so are integers, and whole numbers of which some exceed 10, which are bytes in floats.
     """
+    refuse_bytes("image", image)
     image = as_floats("image", image)
     require_finite("image", image)
     if not is_concrete(image):
         raise ValueError("to_uint8 needs known numbers; call it outside jit and grad.")
     pixels = np.array(image, np.float64)
+    if pixels.max(initial=0) > BRIGHTEST and (pixels == np.rint(pixels)).all():
+        raise ValueError(
+            f"image holds whole numbers up to {pixels.max():g}, but 1 is full intensity. Divide "
+            "bytes by 255."
+        )
     if srgb:
         rgb = pixels[..., :3] if pixels.ndim and pixels.shape[-1] == 4 else pixels
         rgb[...] = np.asarray(linear_to_srgb(np.clip(rgb, 0, 1)))
     return np.rint(np.clip(pixels, 0, 1) * 255).astype(np.uint8)
 
 
-def _pair(a: Any, b: Any) -> tuple[Array, Array]:
+def _refuse_byte_codes(x: Any) -> None:
+    """Plain numbers, such as 0 and 1, are no bytes; arrays of small integers are."""
+    if isinstance(x, np.ndarray | jax.Array) and np.dtype(x.dtype).itemsize <= 2:
+        refuse_bytes("x", x)
+
+
+def _pair(a: Any, b: Any, peak: Any) -> tuple[Array, Array]:
+    _require_peak(a, b, peak)
     a, b = jnp.asarray(as_floats("a", a)), jnp.asarray(as_floats("b", b))
     if a.shape != b.shape:
         raise ValueError(f"The images must have one shape, but have {a.shape} and {b.shape}.")
@@ -148,3 +180,23 @@ def _pair(a: Any, b: Any) -> tuple[Array, Array]:
         raise ValueError(f"The images are empty: their shape is {a.shape}.")
     dtype = jnp.promote_types(a.dtype, b.dtype)
     return a.astype(dtype), b.astype(dtype)
+
+
+def _require_peak(a: Any, b: Any, peak: Any) -> None:
+    """ValueError for images in other units than `peak`, or than each other."""
+    kinds = [getattr(np.dtype(getattr(x, "dtype", float)), "kind", "f") in "iub" for x in (a, b)]
+    if not is_concrete(a, b, peak):
+        return
+    if kinds[0] != kinds[1] or (all(kinds) and float(peak) == 1):
+        for name, x in (("a", a), ("b", b)):
+            refuse_bytes(name, x, "For two images of bytes pass peak=255.")
+    for name, x in (("a", a), ("b", b)):
+        x = np.asarray(x)
+        if x.dtype.kind not in "fiu" or x.size == 0:
+            continue
+        most = float(x.max())
+        if most > BRIGHTEST * float(peak):
+            raise ValueError(
+                f"{name} holds {most:g}, but full intensity is peak={float(peak):g}. Divide bytes "
+                "by 255, or pass another peak."
+            )
