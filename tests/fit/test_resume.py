@@ -439,7 +439,7 @@ def test_seeds_are_whole_numbers(seed):
 
 def test_the_experiment_on_faults_finds_none():
     """In a process of its own, since it forks."""
-    command = [sys.executable, "-m", "experiments.file_faults", "--tiny"]
+    command = [sys.executable, "-m", "experiments.saved_faults", "--tiny"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "kills, checkpoints" in done.stdout and "fault" not in done.stdout

@@ -1,6 +1,6 @@
 """Mutated transfer functions and checkpoints, kills while writing, full disks, read-only places.
 
-    python -m experiments.file_faults [--tiny] [--json FILE]
+    python -m experiments.saved_faults [--tiny] [--json FILE]
 
 A mutant may be refused with a ValueError that names the file, or give what was stored; of a JSON
 text it may be another function too, where numbers were changed. Anything else is a fault. Kills
