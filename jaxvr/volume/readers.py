@@ -8,6 +8,7 @@ asked for by component, and what is taken where there is a choice is told.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 import uuid
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from .geometry import signed_volumes
-from .io import process, registry, sizes
+from .io import process, sizes
 from .io.content import Ask, Field, Trouble
 from .io.fields import AXES
 from .mesh import TetMesh, _from_cells
@@ -65,7 +66,9 @@ def _ask(step: Any, block: Any, limit: int | None) -> Ask:
     if isinstance(step, bool | np.bool_) or not isinstance(
         step, int | float | np.integer | np.floating | None
     ):
-        raise ValueError(f"step must be an integer (an index) or a float (a time), but is {step!r}.")
+        raise ValueError(
+            f"step must be an integer (an index) or a float (a time), but is {step!r}."
+        )
     if isinstance(step, np.integer | np.floating):
         step = step.item()
     if block is not None and not isinstance(block, str):
@@ -96,8 +99,22 @@ def _limits(file: Path, max_memory: Any) -> tuple[int | None, float | None]:
 def _run(job: str, file: Path, max_memory: Any, step: Any, block: Any, **arguments: Any) -> Any:
     memory, seconds = _limits(file, max_memory)
     ask = _ask(step, block, memory)
+    arguments["path"] = str(file)
     try:
-        return process.run(job, memory, seconds, path=str(file), ask=ask, **arguments)
+        try:
+            return process.run(job, memory, seconds, ask=ask, **arguments)
+        except Trouble as e:
+            if e.kind != "crashed":
+                raise
+            crash = e.message
+        try:
+            got = process.run(
+                job, memory, seconds, ask=dataclasses.replace(ask, vtk=False), **arguments
+            )
+        except Trouble as e:
+            raise Trouble("damaged", f"{crash}; without VTK: {e.message or e.kind}") from None
+        warnings.warn(f"{file.name}: {crash}, and another one read it.", UserWarning, stacklevel=3)
+        return got
     except Trouble as e:
         raise _error(file, e, memory, seconds) from None
 
@@ -172,7 +189,7 @@ def read_mesh(
     values: instead of a field of the file: an array as in `TetMesh.from_cells` for its points or
         cells, or a function from points (P, 3) to values (P,).
     max_memory: bytes that reading may take: by default 2 GiB, or 200 times the file's size if that
-        is more, and a minute of computing and 10 s for each MB. `None` lifts both.
+        is more, and half a minute of computing and 10 s for each MB. `None` lifts both.
 
     Zoo cells are subdivided so that they conform; quadratic cells are reduced to their corners;
     convex polyhedra are cut about their centroid, which becomes a point; points, lines and faces

@@ -29,7 +29,7 @@ def read_grid(
     name = type(grid).__name__
     try:
         content = content_of(grid)
-        content.active = _active(grid, location) + content.active
+        content.active = _active(grid, location, content.active)
         if field is None:
             found, _ = choose(name, list_of(content), None, location, content.active)
             field, location = found.name, found.location
@@ -70,9 +70,9 @@ def write_grid(mesh: TetMesh) -> Any:
     return grid
 
 
-def _active(grid: Any, location: str | None) -> list[tuple[str, str]]:
-    """PyVista's choice of active scalars, which goes before VTK's."""
+def _active(grid: Any, location: str | None, vtk: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """PyVista's choice of active scalars; VTK's, points before cells, where it has none."""
     info = getattr(grid, "active_scalars_info", None)
     if info is not None and info.name and location is None:
         return [(info.name, "cell" if info.association.name == "CELL" else "point")]
-    return []
+    return vtk

@@ -1,4 +1,4 @@
-"""What readers give: cells, fields and steps of a file, as arrays; and what may be wrong with it."""
+"""What readers give: cells, fields and steps of a file as arrays; and what may be wrong with it."""
 
 from __future__ import annotations
 
@@ -41,11 +41,12 @@ class Field(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Ask:
     """step: which time step (an index, or a time as a float); block: names or places of blocks;
-    limit: bytes of memory, or None."""
+    limit: bytes of memory, or None; vtk: whether VTK's readers may be taken."""
 
     step: int | float | None = None
     block: Any = None
     limit: int | None = None
+    vtk: bool = True
 
 
 @dataclasses.dataclass
@@ -71,8 +72,8 @@ class Content:
     (N, corners, ...), None where a part lacks it. point_blocks: the blocks that have a point field,
     where not all do. active: the scalars that the file names. blocks: the names of all blocks.
     steps: times of all steps, `step` the index of the one that was read; field_steps: (name,
-    location) to times, where fields have steps of their own. notes: what the caller is warned of. raw: points and
-    cells that the reader found, before any are left out or cut.
+    location) to times, where fields have steps of their own. notes: what the caller is warned of.
+    raw: points and cells that the reader found, before any are left out or cut.
     """
 
     points: np.ndarray

@@ -147,7 +147,13 @@ def arrays_of(
             cells.setdefault(part.type, None)
     for kind, places in solid.items():
         cells[kind] = np.concatenate([content.parts[i].nodes for i in places])
-    out = {"points": content.points, "cells": cells, "values": None, "location": None, "label": None}
+    out = {
+        "points": content.points,
+        "cells": cells,
+        "values": None,
+        "location": None,
+        "label": None,
+    }
     if not want:
         return out
     fields = list_of(content)
@@ -159,7 +165,9 @@ def arrays_of(
     if chosen.location == "point":
         has = content.point_blocks.get(chosen.name)
         if has is not None:
-            _require_everywhere(chosen, [i for i in used if content.parts[i].block not in has], content)
+            _require_everywhere(
+                chosen, [i for i in used if content.parts[i].block not in has], content
+            )
         out["values"] = scalar(content.point[chosen.name], component)
         return out
     arrays = getattr(content, chosen.location)[chosen.name]

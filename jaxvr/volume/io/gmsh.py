@@ -44,10 +44,11 @@ class _Stream:
     def _take(self, n: int, dtype: str, width: int) -> np.ndarray:
         cost = n * width if self.binary else n
         if n < 0 or cost > self.left:
+            left = self.left // width if self.binary else self.left
             raise Trouble(
                 "damaged",
-                f"${self.name} asks for {n} numbers where {max(self.left, 0) // (width if self.binary else 1)} are "
-                "left: it is cut short, or its counts are wrong",
+                f"${self.name} asks for {n} numbers where {left} are left: it is cut short, or its "
+                "counts are wrong",
             )
         self.left -= cost
         try:
@@ -121,11 +122,9 @@ def read(path: Path, ask: Ask, said: Any = None, suffix: str = "") -> Content:
     for name, body in sections:
         if name in known:
             known[name](file, name, body)
-        elif name in ("Parametrizations", "InterpolationScheme", "PartitionedEntities"):
+        elif name == "PartitionedEntities":
             skipped.add(name)
     content = _content(file, ask)
-    if "InterpolationScheme" in skipped:
-        content.notes.append("$InterpolationScheme is not read: fields are linear in their cells.")
     if "PartitionedEntities" in skipped:
         content.notes.append("$PartitionedEntities are not read: cells have no physical groups.")
     content.reader = f"jaxvr (gmsh {file.version})"
@@ -450,7 +449,7 @@ def _fields(
             arrays.append(values[..., 0] if values.shape[-1] == 1 else values)
         if used < len(data.ids):
             content.notes.append(
-                f"Field {label!r} has values for {len(data.ids) - used} elements that are not there."
+                f"Field {label!r} has values for {len(data.ids) - used} elements that do not exist."
             )
         getattr(content, where)[label] = arrays
 
@@ -460,7 +459,9 @@ def _corner_rows(
 ) -> np.ndarray:
     sizes = {len(data.values[r]) for r in rows[hit]}
     if len(sizes) > 1:
-        raise Trouble("damaged", f"field {label!r} has {sorted(sizes)} corners in {part.type} cells")
+        raise Trouble(
+            "damaged", f"field {label!r} has {sorted(sizes)} corners in {part.type} cells"
+        )
     width = sizes.pop()
     nan = np.full((width, data.values[0].shape[1]), np.nan)
     return np.array([data.values[r] if h else nan for r, h in zip(rows, hit, strict=True)])

@@ -1,7 +1,7 @@
 """Files that meshio reads, with what its readers pass over told or read another way.
 
-Several of them wait in a loop for a line that a file cut short does not have (`endguard`); all print
-and some end the process: here that is a process of its own (`child`). Files with several time steps
+Several of them wait in a loop for a line that a file cut short does not have (`endguard`); all
+print and some end the process: here that is a process of its own (`child`). Files with several time steps
 are read where meshio can (XDMF). What meshio warns of goes on as a note.
 """
 
@@ -62,9 +62,11 @@ def _patched(meshio: Any, path: Path, file_format: str) -> Any:
         text = path.read_bytes()
         if b"BEGIN BULK" not in text.upper():  # optional in bulk data files, as gmsh writes them
             with io.StringIO("BEGIN BULK\n" + text.decode("utf-8", "replace")) as f:
-                return meshio.nastran.read_buffer(f) if hasattr(
-                    meshio.nastran, "read_buffer"
-                ) else meshio.nastran._nastran.read_buffer(f)
+                return (
+                    meshio.nastran.read_buffer(f)
+                    if hasattr(meshio.nastran, "read_buffer")
+                    else meshio.nastran._nastran.read_buffer(f)
+                )
     if file_format == "abaqus":
         text = path.read_text("utf-8", "replace")
         if (merged := _one_node_section(text)) is not None:
@@ -100,7 +102,9 @@ def content_of(mesh: Any) -> Content:
     """What a meshio.Mesh holds."""
     points = np.asarray(mesh.points)
     if points.ndim != 2 or not mesh.cells:
-        raise Trouble("damaged", f"it holds no mesh: points {points.shape}, {len(mesh.cells)} cells")
+        raise Trouble(
+            "damaged", f"it holds no mesh: points {points.shape}, {len(mesh.cells)} cells"
+        )
     content = Content(points, [], point={k: np.asarray(a) for k, a in mesh.point_data.items()})
     rows: list[Any] = []
     start = 0
@@ -125,7 +129,9 @@ def content_of(mesh: Any) -> Content:
         for row, block, a in zip(rows, mesh.cells, parts, strict=True):
             a = np.asarray(a)
             if len(a) != len(block.data):
-                raise Trouble("damaged", f"field {name!r} has {len(a)} values for {len(block.data)}")
+                raise Trouble(
+                    "damaged", f"field {name!r} has {len(a)} values for {len(block.data)}"
+                )
             arrays.append(None if row is None else a[row])
         content.cell[name] = arrays
     for name, a in content.point.items():
@@ -153,12 +159,6 @@ def _xdmf_series(path: Path, ask: Ask) -> Content | None:
     import meshio
 
     root = ElementTree.parse(path).getroot()
-    missing = {
-        m for e in root.iter("DataItem") if (m := (e.text or "").strip().partition(":/")[0])
-        if ":/" in (e.text or "") and not (path.parent / m).is_file()
-    }  # fmt: skip
-    if missing:
-        raise Trouble("damaged", f"it names {sorted(missing)[0]!r}, which is not there")
     temporal = [g for g in root.iter("Grid") if g.get("CollectionType", "").lower() == "temporal"]
     if not temporal:
         return None

@@ -88,9 +88,7 @@ def _outward(
     return np.concatenate(found)
 
 
-def _convex(
-    points: np.ndarray, corners: np.ndarray, faces: list[list[int]]
-) -> bool:
+def _convex(points: np.ndarray, corners: np.ndarray, faces: list[list[int]]) -> bool:
     size = np.linalg.norm(corners.max(0) - corners.min(0))
     for f in faces:
         q = points[f] - points[f].mean(0)  # far from the origin digits count

@@ -37,7 +37,9 @@ _pool = _Pool()
 
 def _start() -> subprocess.Popen[bytes]:
     if not sys.executable:
-        raise Trouble("system", "Files are read in a process of its own, and Python cannot start one.")
+        raise Trouble(
+            "system", "Files are read in a process of its own, and Python cannot start one."
+        )
     more: dict[str, Any] = {}
     if os.name == "nt":
         more["creationflags"] = subprocess.CREATE_NO_WINDOW  # type: ignore[attr-defined]
@@ -115,8 +117,8 @@ def _gone(process: subprocess.Popen[bytes]) -> Trouble:
         code = process.wait(timeout=10)
     except subprocess.TimeoutExpired:
         return Trouble("system", "The process that reads files does not answer.")
-    if code == -getattr(signal, "SIGXCPU", 10**6):
+    if -code in (getattr(signal, "SIGXCPU", 0), getattr(signal, "SIGPROF", 0)) and code:
         return Trouble("slow", "")
     if code in (-signal.SIGABRT, -getattr(signal, "SIGKILL", 9)):  # C++'s std::bad_alloc aborts
         return Trouble("large", "")
-    return Trouble("damaged", f"the reader crashed (exit code {code})")
+    return Trouble("crashed", f"the reader crashed (exit code {code})")

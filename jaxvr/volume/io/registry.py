@@ -7,10 +7,10 @@ and a note says so.
 
 from __future__ import annotations
 
-import os
+import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from . import exodus, gmsh, meshio_files, sizes, vtk_files
 from .content import Ask, Content, Trouble, join, pick_blocks, pick_step
@@ -22,13 +22,8 @@ OWN: dict[str, list[Reader]] = {
     ".msh": [gmsh.read],
     ".e": [exodus.read],
 }
-_FIRST_VTK_THEN_MESHIO = {".vtu", ".vtk", ".xdmf", ".avs", ".dat"}
-# Several formats share a suffix: meshio's goes first.
-_MESHIO_FIRST = {".dat", ".avs"}
-# What a missing package would read, for files that nobody reads as it is.
-ADVICE = {
-    ".cgns": "vtk", ".e": "netCDF4", ".med": "h5py", ".xdmf": "h5py", ".h5m": "h5py",
-}  # fmt: skip
+# Where meshio knows more of the format, or VTK's reader does not end or crashes on healthy files.
+_MESHIO_FIRST = {".dat", ".avs", ".xdmf"}
 NEED = {"h5py": "h5py", "netCDF4": "netCDF4", "vtkmodules": "vtk", "vtk": "vtk"}
 # Suffixes that nobody here reads, and what does.
 ELSEWHERE = {
@@ -60,7 +55,7 @@ def suffix_of(path: Path) -> str:
     own = path.suffix.lower()
     own = vtk_files.SAME.get(own, own)
     for mark, tool in _PACKED.items():
-        if head.startswith(mark):
+        if head.startswith(mark) and own not in ELSEWHERE:
             raise Trouble("unsupported", f"it is packed: {tool} it first")
     if text.startswith(b"# vtk DataFile"):
         return ".vtk"
@@ -89,9 +84,9 @@ def known() -> list[str]:
     return sorted({*own, *meshio.extension_to_filetypes})
 
 
-def _readers(suffix: str) -> list[Reader]:
+def _readers(suffix: str, vtk: bool) -> list[Reader]:
     found: list[Reader] = []
-    if suffix in vtk_files.READERS:
+    if suffix in vtk_files.READERS and vtk:
         found.append(vtk_files.read)
     found += OWN.get(suffix, [])
     import meshio
@@ -108,9 +103,11 @@ def read(path: Path, ask: Ask, said: Callable[[], str]) -> Content:
     suffix = suffix_of(path)
     if suffix in (".pvd", ".series"):
         return _series(path, ask, said, suffix)
-    readers = _readers(suffix)
+    readers = _readers(suffix, ask.vtk)
     if not readers:
         raise Trouble("suffix", _unknown(path, suffix))
+    if suffix == ".xdmf":
+        _require_beside(path)
     counts = sizes.claims(path, suffix)
     missing: list[str] = []
     failed: list[Trouble] = []
@@ -139,9 +136,20 @@ def read(path: Path, ask: Ask, said: Callable[[], str]) -> Content:
     if missing:
         raise _missing(missing, failed)
     kinds = [e for e in failed if e.kind == "unsupported"]
-    raise (kinds or failed)[0] if len(failed) == 1 or kinds else Trouble(
-        "damaged", "; ".join(dict.fromkeys(e.message for e in failed))
+    raise (
+        (kinds or failed)[0]
+        if len(failed) == 1 or kinds
+        else Trouble("damaged", "; ".join(dict.fromkeys(e.message for e in failed)))
     )
+
+
+def _require_beside(path: Path) -> None:
+    """Trouble where files that an XDMF file names are not there: VTK's reader crashes then."""
+    text = path.read_text("utf-8", "replace")
+    for name in dict.fromkeys(re.findall(r">\s*([^<>\s][^<>:\n]*?\.h(?:5|df5?)):/", text)):
+        if not (path.parent / name).is_file():
+            series = " (of a time series)" if "Temporal" in text else ""
+            raise Trouble("damaged", f"its numbers are in {name!r}{series}, which is not there")
 
 
 def _missing(packages: list[str], failed: list[Trouble]) -> Trouble:
@@ -169,9 +177,9 @@ def _series(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Conte
     times = tuple(sorted({t for t, _, _ in entries}))
     step = pick_step(times, ask.step)
     here = [(name, file) for t, name, file in entries if t == times[step]]
-    inner = Ask(None, None, ask.limit)
+    inner = dataclasses.replace(ask, step=None, block=None)
     if len(here) == 1:
-        content = read(here[0][1], Ask(None, ask.block, ask.limit), said)
+        content = read(here[0][1], dataclasses.replace(ask, step=None), said)
     else:
         names = tuple(name for name, _ in here)
         chosen = pick_blocks(names, ask.block)
@@ -181,5 +189,3 @@ def _series(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Conte
     if len(times) > 1:
         content.steps, content.step = times, step
     return content
-
-

@@ -16,10 +16,14 @@ from .content import Content, Trouble
 
 LEAST = 2 << 30  # bytes that any file may take
 TIMES = 200  # what a byte of a file may take, if that is more
-SECONDS = 60.0  # of computing, for any file
+SECONDS = 30.0  # of computing, for any file
 SPEED = 1e5  # bytes a second, above that
 # What a byte can come to by each of VTK's compressors, at most: by their formats.
-_RATIO = {"vtkZLibDataCompressor": 1032, "vtkLZ4DataCompressor": 255, "vtkLZMADataCompressor": 10**5}
+_RATIO = {
+    "vtkZLibDataCompressor": 1032,
+    "vtkLZ4DataCompressor": 255,
+    "vtkLZMADataCompressor": 10**5,
+}
 _PARTS = {".pvd", ".series", ".pvtu", ".pvti", ".pvtr", ".pvts", ".vtm", ".vtmb", ".vtpd", ".vtpc",
           ".case", ".encas", ".xdmf", ".xmf", ".foam"}  # fmt: skip
 Counts = dict[str, int]

@@ -8,6 +8,7 @@ Cells that VTK does not draw (blanked ones, and ghosts of another process) are l
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,9 @@ _CUT = (15, 16, 42)  # what `polyhedra` cuts
 VOXEL_BYTES = 700  # what a cell of a structured grid comes to when it is cut into tetrahedra
 
 
-def content_of(data: Any, blocks: Any = None, limit: int | None = None, what: str = "It") -> Content:
+def content_of(
+    data: Any, blocks: Any = None, limit: int | None = None, what: str = "It"
+) -> Content:
     """A data set, or a composite of them, of which `blocks` are taken. what: its name in errors.
 
     limit: bytes that cells of grids which say only their extent may come to.
@@ -45,16 +48,26 @@ def content_of(data: Any, blocks: Any = None, limit: int | None = None, what: st
         return _single(data, limit, what)
     if data is None or not data.IsA("vtkCompositeDataSet"):
         kind = "nothing" if data is None else data.GetClassName()
-        raise Trouble("unsupported", f"{what} holds {kind}, which is no grid and no blocks of them.")
+        raise Trouble(
+            "unsupported", f"{what} holds {kind}, which is no grid and no blocks of them."
+        )
     leaves = [(name, leaf) for name, leaf in leaves_of(data) if leaf.IsA("vtkDataSet")]
     if not leaves:
         raise Trouble("damaged", f"{what} holds no blocks with data.")
-    names = unique([name for name, _ in leaves])
+    names = unique(_short([name for name, _ in leaves]))
     chosen = pick_blocks(tuple(names), blocks)
     contents = [_single(leaves[k][1], limit, what) for k in chosen]
     out = join(contents, [names[k] for k in chosen])
     out.blocks = tuple(names)
     return out
+
+
+def _short(names: list[str]) -> list[str]:
+    """Without the levels that all have, and as the file has them (VTK's words for Exodus ids)."""
+    split = [name.split("/") for name in names]
+    while all(len(s) > 1 and s[0] == split[0][0] for s in split):
+        split = [s[1:] for s in split]
+    return [re.sub(r"Unnamed block ID: (\d+)( Type: \w+)?", r"\1", "/".join(s)) for s in split]
 
 
 def unique(names: list[str]) -> list[str]:
@@ -149,9 +162,7 @@ def _single(given: Any, limit: int | None, what: str) -> Content:
     points = np.zeros((0, 3)) if points is None else numpy_of(points.GetData())
     content = Content(points=points, parts=[], point=point, active=names, notes=notes)
     rows = _parts(content, grid, point.pop(GHOSTS, None), cell.pop(GHOSTS, None))
-    content.cell = {
-        name: [None if r is None else a[r] for r in rows] for name, a in cell.items()
-    }
+    content.cell = {name: [None if r is None else a[r] for r in rows] for name, a in cell.items()}
     return content
 
 

@@ -33,7 +33,9 @@ def write(
     import meshio
 
     file = Path(path)
-    data = {"point_data": {name: values}} if location == "point" else {"cell_data": {name: [values]}}
+    data = (
+        {"point_data": {name: values}} if location == "point" else {"cell_data": {name: [values]}}
+    )
     mesh = meshio.Mesh(points, [("tetra", tets)], **data)
     folder = Path(workshop)
     try:
@@ -54,9 +56,7 @@ def write(
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _require_whole(
-    made: Path, n: int, name: str, location: str, said: Callable[[], str]
-) -> None:
+def _require_whole(made: Path, n: int, name: str, location: str, said: Callable[[], str]) -> None:
     """Some formats leave out, in silence, what they cannot hold."""
     from . import fields, registry
     from .content import Ask
@@ -90,4 +90,3 @@ def _move(folder: Path, file: Path) -> None:
             os.fsync(fd)
         finally:
             os.close(fd)
-
