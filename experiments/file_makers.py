@@ -55,13 +55,13 @@ def with_fields(grid: Any) -> Any:
     return grid
 
 
-def lattice(n: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """points and hexahedra of a cube, moved a little where that keeps faces plane: sheared."""
+def lattice(n: int = 2, sheared: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """points and hexahedra of a cube, sheared a little, which keeps faces plane."""
     axis = np.arange(n + 1.0)
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
-    points = np.stack([x.ravel(), y.ravel(), z.ravel()], 1) @ np.array(
-        [[1, 0.1, 0], [0, 1, 0.2], [0.1, 0, 1]]
-    )
+    points = np.stack([x.ravel(), y.ravel(), z.ravel()], 1)
+    if sheared:
+        points = points @ np.array([[1, 0.1, 0], [0, 1, 0.2], [0.1, 0, 1]])
     k, j, i = np.meshgrid(np.arange(n), np.arange(n), np.arange(n), indexing="ij")
     m = n + 1
     first = (i + m * (j + m * k)).ravel()
@@ -154,16 +154,53 @@ _vtu("VTU, 64-bit headers", SetHeaderType=64)
 _vtu("VTU, 32-bit ids", SetIdType=32)
 
 
-@kind("VTU, several pieces", "VTK")
+def thirds() -> tuple[Any, list[Any]]:
+    """A grid, and three pieces of it with points of their own."""
+    import pyvista
+
+    whole = hexahedra(3)
+    pieces = []
+    for k in range(3):
+        piece = whole.extract_cells(np.arange(9 * k, 9 * k + 9))
+        for data, kept in ((piece.point_data, ("t", "v")), (piece.cell_data, ("c",))):
+            for key in [key for key in data if key not in kept]:
+                del data[key]
+        pieces.append(pyvista.UnstructuredGrid(piece))
+    return whole, pieces
+
+
+@kind("VTU, several pieces", "VTK, by hand")
 def _pieces(place: Path) -> Made:
-    grid = hexahedra(3)
-    xml(grid, place / "a.vtu", SetNumberOfPieces=3, SetDataMode=0)
+    grid, pieces = thirds()
+    parts = []
+    for piece in pieces:
+        xml(piece, place / "piece.vtu", SetDataMode=0)
+        text = (place / "piece.vtu").read_text()
+        parts.append(text[text.index("<Piece") : text.index("</Piece>") + 8])
+    text = text[: text.index("<Piece")] + "\n".join(parts) + text[text.index("</Piece>") + 8 :]
+    (place / "a.vtu").write_text(text)
     return Made(place / "a.vtu", grid)
+
+
+@kind("PVTU, three pieces", "VTK, by hand")
+def _pvtu(place: Path) -> Made:
+    grid, pieces = thirds()
+    for k, piece in enumerate(pieces):
+        xml(piece, place / f"a{k}.vtu")
+    sources = "".join(f'<Piece Source="a{k}.vtu"/>' for k in range(3))
+    double = '<PDataArray type="Float64" Name="{}" NumberOfComponents="{}"/>'
+    (place / "a.pvtu").write_text(
+        '<VTKFile type="PUnstructuredGrid" version="1.0" byte_order="LittleEndian">'
+        f'<PUnstructuredGrid GhostLevel="0"><PPointData>{double.format("t", 1)}'
+        f"{double.format('v', 3)}</PPointData><PCellData>{double.format('c', 1)}</PCellData>"
+        f"<PPoints>{double.format('Points', 3)}</PPoints>{sources}</PUnstructuredGrid></VTKFile>"
+    )
+    return Made(place / "a.pvtu", grid)
 
 
 @kind("VTU, voxels among hexahedra, pixels, strips, polygons", "VTK")
 def _voxels(place: Path) -> Made:
-    points, h = lattice(2)
+    points, h = lattice(2, sheared=False)
     swap = [0, 1, 3, 2, 4, 5, 7, 6]
     grid = unstructured(
         [(11, h[:3, swap]), (12, h[3:]), (8, [h[0][[0, 1, 3, 2]]]), (6, [h[0][[0, 1, 3, 2]]]),
@@ -317,7 +354,9 @@ _legacy("legacy VTK 4.2, binary", 42, 2)
 def image(n: int = 3) -> Any:
     import pyvista
 
-    return with_fields(pyvista.ImageData(dimensions=(n + 1, n, n), spacing=(0.5, 1, 2), origin=(1, 2, 3)))
+    return with_fields(
+        pyvista.ImageData(dimensions=(n + 1, n, n), spacing=(0.5, 1, 2), origin=(1, 2, 3))
+    )
 
 
 def _structured(name: str, suffix: str, cast: str | None) -> None:
@@ -357,7 +396,6 @@ def _parallel(name: str, suffix: str, source: Callable[[], Any]) -> None:
     kind(name, "VTK")(make)
 
 
-_parallel("PVTU, two pieces", ".pvtu", lambda: hexahedra(3))
 _parallel("PVTS", ".pvts", lambda: image().cast_to_structured_grid())
 _parallel("PVTI", ".pvti", image)
 
@@ -593,7 +631,7 @@ def meshio_of(grid: Any, cells: bool = True) -> Any:
 
     names = {10: "tetra", 12: "hexahedron", 13: "wedge", 14: "pyramid"}
     blocks, data, at = [], [], 0
-    flat, offsets = grid.cell_connectivity, grid.offset
+    flat, offsets = grid.cell_connectivity, grid.cell_offsets
     kinds = np.asarray(grid.celltypes)
     while at < len(kinds):
         end = at
@@ -639,7 +677,7 @@ _meshio("XDMF, numbers in HDF5", "a.xdmf", tetrahedra)
 _meshio("XDMF, mixed cells", "a.xdmf", zoo, data_format="XML")
 _meshio("Exodus by meshio", "a.e", tetrahedra, cells=False)
 _meshio("MED", "a.med", tetrahedra)
-_meshio("Abaqus", "a.inp", zoo, None, "abaqus", False)
+_meshio("Abaqus", "a.inp", hexahedra, None, "abaqus", False)
 _meshio("Nastran", "a.bdf", tetrahedra, None, cells=False)
 _meshio("Medit", "a.mesh", tetrahedra, None, cells=False)
 _meshio("SU2", "a.su2", zoo, None, cells=False)

@@ -6,8 +6,8 @@ are shared by all its threads; so files are read and written in processes of the
 starts them and keeps a few, `child` is what runs there), and what comes back is arrays.
 
 A reader is a function from a path and an `Ask` to a `Content` (`content`): points, cells by type
-and block, fields, steps. `registry` says which readers take a file, by its first bytes and its suffix,
-and in which order: VTK's (`vtk_files`) where the package is installed, gmsh's format (`gmsh`),
+and block, fields, steps. `registry` says which readers take a file, by its first bytes and its
+suffix, and in which order: VTK's (`vtk_files`) where the package is installed, gmsh's format (`gmsh`),
 Exodus on netCDF (`exodus`), meshio's (`meshio_files`). `sizes` compares the counts that a file
 claims with its size before anybody reads it, and with what came out afterwards. `polyhedra` cuts
 what is no cell of the zoo. `fields` chooses a field. `write` writes.

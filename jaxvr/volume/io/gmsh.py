@@ -359,6 +359,8 @@ def _data(file: _File, name: str, body: bytes) -> None:
         raise Trouble("damaged", f"${name} has the integer tags {integers}")
     label = strings[0].strip(b'"').decode("utf-8", "replace") if strings else name
     step, width, n = integers[:3]
+    if not file.binary and b"np." in body:  # as meshio writes with NumPy 2
+        body = re.sub(rb"np\.\w+\(([^()]*)\)", rb"\1", body)
     s = _stream(file, name, body)
     time = reals[0] if reals else float(step)
     if name != "ElementNodeData":

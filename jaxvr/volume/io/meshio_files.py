@@ -1,8 +1,8 @@
 """Files that meshio reads, with what its readers pass over told or read another way.
 
 Several of them wait in a loop for a line that a file cut short does not have (`endguard`); all
-print and some end the process: here that is a process of its own (`child`). Files with several time steps
-are read where meshio can (XDMF). What meshio warns of goes on as a note.
+print and some end the process: here that is a process of its own (`child`). Files with several
+time steps are read where meshio can (XDMF). What meshio warns of goes on as a note.
 """
 
 from __future__ import annotations
@@ -72,7 +72,22 @@ def _patched(meshio: Any, path: Path, file_format: str) -> Any:
         if (merged := _one_node_section(text)) is not None:
             with io.StringIO(merged) as f:
                 return meshio.abaqus._abaqus.read_buffer(f)
+    if file_format == "med":
+        _without_groups(meshio.med._med)
     return meshio.read(path, file_format)
+
+
+def _without_groups(module: Any) -> None:
+    """Families of a MED file may have no groups, as gmsh writes them: they have no names then."""
+    given = module._read_families
+    if given.__name__ != "_read_families":
+        return
+
+    def families(data: Any) -> Any:
+        named = {k: v for k, v in data.items() if "GRO" in v}
+        return given(named) | {v.attrs["NUM"]: [] for k, v in data.items() if k not in named}
+
+    module._read_families = families
 
 
 def _one_node_section(text: str) -> str | None:

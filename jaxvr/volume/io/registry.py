@@ -24,6 +24,7 @@ OWN: dict[str, list[Reader]] = {
 }
 # Where meshio knows more of the format, or VTK's reader does not end or crashes on healthy files.
 _MESHIO_FIRST = {".dat", ".avs", ".xdmf"}
+_OWN_FIRST = {".e"}  # VTK misreads some, without a word
 NEED = {"h5py": "h5py", "netCDF4": "netCDF4", "vtkmodules": "vtk", "vtk": "vtk"}
 # Suffixes that nobody here reads, and what does.
 ELSEWHERE = {
@@ -88,7 +89,8 @@ def _readers(suffix: str, vtk: bool) -> list[Reader]:
     found: list[Reader] = []
     if suffix in vtk_files.READERS and vtk:
         found.append(vtk_files.read)
-    found += OWN.get(suffix, [])
+    own = OWN.get(suffix, [])
+    found = [*own, *found] if suffix in _OWN_FIRST else [*found, *own]
     import meshio
 
     if suffix in meshio.extension_to_filetypes and suffix not in OWN:

@@ -57,6 +57,9 @@ _TROUBLE = re.compile(r"(?:ERR\||ERROR: In|Error:|Generic Warning: In.*(?:[Ee]rr
 def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
     """One of the files of `READERS`. Raises ImportError without VTK."""
     suffix = SAME.get(suffix, suffix)
+    if suffix == ".e" and b"dim_nod_var" in path.read_bytes():
+        # meshio's Exodus files: VTK takes other numbers for their values, without a word
+        raise ImportError("netCDF4", name="netCDF4")
     module, name = READERS[suffix]
     reader = getattr(importlib.import_module(f"vtkmodules.{module}"), name)()
     if suffix == ".case":
@@ -138,7 +141,6 @@ def _switch_on(reader: Any, suffix: str) -> None:
             reader.SetObjectStatus(reader.ELEM_BLOCK, k, 1)
     elif suffix == ".foam":
         reader.CreateCellToPointOff()
-        reader.DecomposePolyhedraOff()
         reader.EnableAllCellArrays()
         reader.EnableAllPointArrays()
     elif suffix == ".cgns":
