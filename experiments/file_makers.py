@@ -22,6 +22,8 @@ class Made:
     truth: Any
     field: str | None = "t"
     how: dict[str, Any] = dataclasses.field(default_factory=dict)
+    tolerance: float = 1e-6  # of the volume
+    note: str = ""
 
 
 @dataclasses.dataclass
@@ -92,8 +94,8 @@ def zoo() -> Any:
     a = h[2]
     wedges = [[a[0], a[2], a[1], a[4], a[6], a[5]], [a[0], a[3], a[2], a[4], a[7], a[6]]]
     b = h[7]  # its faces to others are cut by diagonals of their own: nothing lies beside it
-    tets = [[b[0], b[1], b[2], b[6]], [b[0], b[2], b[3], b[6]], [b[0], b[3], b[7], b[6]],
-            [b[0], b[7], b[4], b[6]], [b[0], b[4], b[5], b[6]], [b[0], b[5], b[1], b[6]]]  # fmt: skip
+    ring = [1, 2, 3, 7, 4, 5]
+    tets = [[b[0], b[p], b[q], b[6]] for p, q in zip(ring, ring[1:] + ring[:1], strict=True)]
     return unstructured([(12, [h[0], h[4]]), (13, wedges), (14, pyramids), (10, tets)], points)
 
 
@@ -647,8 +649,8 @@ def meshio_of(grid: Any, cells: bool = True) -> Any:
 
 
 def _meshio(
-    name: str, file: str, source: Callable[[], Any], field: str | None = "t", form: str | None = None,
-    cells: bool = True, **how: Any,
+    name: str, file: str, source: Callable[[], Any], field: str | None = "t",
+    form: str | None = None, cells: bool = True, **how: Any,
 ) -> None:  # fmt: skip
     """field: None for formats without fields, whose values are given."""
 
@@ -782,8 +784,8 @@ def _gmsh(
             gmsh.option.setNumber("PostProcessing.SaveMesh", 0)
             path = place / file
             gmsh.write(str(path))
-            truth = gmsh_truth(gmsh, (2,) if how.get("block") == "right" else (1, 2),
-                               10.0 if field == "t" and how.get("step") is None else 0.0)  # fmt: skip
+            shift = 10.0 if field == "t" and how.get("step") is None else 0.0
+            truth = gmsh_truth(gmsh, (2,) if how.get("block") == "right" else (1, 2), shift)
             if field:
                 _gmsh_view(gmsh, field, path)
         finally:

@@ -7,10 +7,11 @@ starts them and keeps a few, `child` is what runs there), and what comes back is
 
 A reader is a function from a path and an `Ask` to a `Content` (`content`): points, cells by type
 and block, fields, steps. `registry` says which readers take a file, by its first bytes and its
-suffix, and in which order: VTK's (`vtk_files`) where the package is installed, gmsh's format (`gmsh`),
-Exodus on netCDF (`exodus`), meshio's (`meshio_files`). `sizes` compares the counts that a file
-claims with its size before anybody reads it, and with what came out afterwards. `polyhedra` cuts
-what is no cell of the zoo. `fields` chooses a field. `write` writes.
+suffix, and in which order: VTK's (`vtk_files`, `vtk_data`) where the package is installed, gmsh's
+format (`gmsh`), Exodus on netCDF (`exodus`), meshio's (`meshio_files`). `sizes` compares the counts
+that a file claims with its size before anybody reads it, and with what came out afterwards.
+`polyhedra` cuts what is no cell of the zoo. `fields` chooses a field. `write` writes. `jobs` is
+what the process is asked for.
 
 To add a format: a reader here, and a line in `registry`. It raises `Trouble`, which says whether a
 file is damaged, of a kind that is not supported, in need of a package or too large, and leaves

@@ -136,7 +136,8 @@ def _ugrid(path: Path, size: int) -> Counts:
             numbers = np.frombuffer(head, "<i4" if m[1] else ">i4", 7, at).tolist()
             least = 4
         else:
-            numbers, least = [int(w) for w in head.split()[:7]], 2
+            words = re.sub(rb"np\.\w+\(([^()]*)\)", rb"\1", head).split()  # by NumPy 2
+            numbers, least = [int(w) for w in words[:7]], 2
     except ValueError:
         raise Trouble("damaged", "its seven counts cannot be read") from None
     for n, what in zip(numbers, ("points", "triangles", "quads", "tetra", "pyramids", "wedges", "hexahedra")):  # noqa: E501  # fmt: skip

@@ -7,6 +7,7 @@ file that was there before. What formats put beside it (.h5) goes with it.
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Callable
@@ -46,7 +47,9 @@ def write(
             _require_whole(made, len(tets), name, location, said)
         _move(folder, file)
     except OSError as e:
-        raise Trouble("system", f"{e.errno or 0}:{e.strerror or e}") from e
+        if e.errno is None and "requested and" in str(e):  # of NumPy, where a write fell short
+            raise Trouble("system", f"{errno.ENOSPC}:{os.strerror(errno.ENOSPC)}") from e
+        raise Trouble("system", f"{e.errno or errno.EIO}:{e.strerror or e}") from e
     except (ImportError, MemoryError, Trouble):
         raise
     except BaseException as e:  # meshio raises anything, SystemExit included
