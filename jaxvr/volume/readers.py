@@ -189,7 +189,7 @@ def read_mesh(
     values: instead of a field of the file: an array as in `TetMesh.from_cells` for its points or
         cells, or a function from points (P, 3) to values (P,).
     max_memory: bytes that reading may take: by default 2 GiB, or 200 times the file's size if that
-        is more, and half a minute of computing and 10 s for each MB. `None` lifts both.
+        is more, and 15 s of computing and 10 s for each MB. `None` lifts both.
 
     Zoo cells are subdivided so that they conform; quadratic cells are reduced to their corners;
     convex polyhedra are cut about their centroid, which becomes a point; points, lines and faces

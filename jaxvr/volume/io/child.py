@@ -16,14 +16,14 @@ import os
 import pickle
 import struct
 import sys
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 TAKEN = b"!"
 IDLE_S = 120  # then the process ends by itself
 SAID = 20_000  # characters of what readers print that are kept
 
 
-def send(stream: BinaryIO, what: Any) -> None:
+def send(stream: IO[bytes], what: Any) -> None:
     """A pickle whose arrays follow it as they are."""
     buffers: list[pickle.PickleBuffer] = []
     head = pickle.dumps(what, protocol=5, buffer_callback=buffers.append)
@@ -36,7 +36,7 @@ def send(stream: BinaryIO, what: Any) -> None:
     stream.flush()
 
 
-def receive(stream: BinaryIO) -> Any:
+def receive(stream: IO[bytes]) -> Any:
     """What `send` wrote; EOFError where the stream ends before."""
     size, n = struct.unpack("<QQ", _exactly(stream, 16))
     sizes = struct.unpack(f"<{n}Q", _exactly(stream, 8 * n))
@@ -44,7 +44,7 @@ def receive(stream: BinaryIO) -> Any:
     return pickle.loads(head, buffers=[_exactly(stream, k) for k in sizes])
 
 
-def _exactly(stream: BinaryIO, n: int) -> bytearray:
+def _exactly(stream: IO[bytes], n: int) -> bytearray:
     out = bytearray(n)
     view, at = memoryview(out), 0
     while at < n:

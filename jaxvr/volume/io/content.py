@@ -9,9 +9,13 @@ import numpy as np
 
 from .. import cells as zoo
 
+# Bits of vtkGhostType: duplicate, refined and hidden cells; hidden points.
+NOT_DRAWN = {"cell": 1 | 8 | 32, "point": 2}
+
 
 class Trouble(Exception):
-    """Why a file is not read. kind: "damaged"; "unsupported", a kind that nobody here reads;
+    """Why a file is not read. kind: "damaged"; "malformed", which no
+    other reader would read right; "unsupported", a kind that nobody here reads;
     "package", one that a missing package reads; "suffix", an unknown one; "large"; "asked", where
     the file is right and what was asked for is not in it; "system", an error of the disk."""
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..endguard import ending
 from . import polyhedra
-from .content import Ask, Content, Part, Trouble, is_solid, pick_step
+from .content import NOT_DRAWN, Ask, Content, Part, Trouble, is_solid, pick_step
 
 
 def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
@@ -131,7 +131,8 @@ def content_of(mesh: Any) -> Content:
             content.parts.append(Part("polyhedron parts", tets))
             rows.append(parent)
         elif is_solid(block.type):
-            content.parts.append(Part(block.type, np.asarray(block.data)))
+            name = block.type.removeprefix("VTK_").lower().replace("_", " ")
+            content.parts.append(Part(name, np.asarray(block.data)))
             rows.append(slice(None))
         else:
             content.parts.append(Part(block.type, n))
@@ -153,7 +154,29 @@ def content_of(mesh: Any) -> Content:
         if len(a) != len(content.points):
             raise Trouble("damaged", f"field {name!r} has {len(a)} values for {len(points)} points")
     content.raw = (len(points), start)
+    _without_ghosts(content)
     return content
+
+
+def _without_ghosts(content: Content) -> None:
+    """Leaves out the cells that VTK does not draw: see `vtk_data`."""
+    hidden = content.point.pop("vtkGhostType", None)
+    kinds, levels = (content.cell.pop(f"vtkGhost{w}", None) for w in ("Type", "Levels"))
+    for k, part in enumerate(content.parts):
+        if isinstance(part.nodes, int):
+            continue
+        drawn = np.ones(len(part), bool)
+        if kinds is not None:
+            drawn &= np.asarray(kinds[k]).astype(int) & NOT_DRAWN["cell"] == 0
+        if levels is not None:
+            drawn &= np.asarray(levels[k]) == 0
+        if hidden is not None:
+            drawn &= (hidden.astype(int) & NOT_DRAWN["point"] == 0)[part.nodes].all(1)
+        if not drawn.all():
+            part.nodes = part.nodes[drawn]
+            for arrays in content.cell.values():
+                a = arrays[k]
+                arrays[k] = None if a is None else a[drawn]
 
 
 def _active(path: Path) -> list[tuple[str, str]]:

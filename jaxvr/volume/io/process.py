@@ -40,15 +40,13 @@ def _start() -> subprocess.Popen[bytes]:
         raise Trouble(
             "system", "Files are read in a process of its own, and Python cannot start one."
         )
-    more: dict[str, Any] = {}
-    if os.name == "nt":
-        more["creationflags"] = subprocess.CREATE_NO_WINDOW  # type: ignore[attr-defined]
+    window = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # Windows opens one otherwise
     return subprocess.Popen(
         [sys.executable, "-I", "-W", "ignore", str(_CHILD)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        **more,
+        creationflags=window,
     )
 
 

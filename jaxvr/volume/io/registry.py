@@ -100,12 +100,17 @@ def _readers(suffix: str, vtk: bool) -> list[Reader]:
     return found
 
 
+def _is_gmsh(path: Path) -> bool:
+    with open(path, "rb") as f:
+        return f.read(40).lstrip().startswith(b"$")
+
+
 def read(path: Path, ask: Ask, said: Callable[[], str]) -> Content:
     """The content of a file. Raises Trouble."""
     suffix = suffix_of(path)
     if suffix in (".pvd", ".series"):
         return _series(path, ask, said, suffix)
-    readers = _readers(suffix, ask.vtk)
+    readers = [gmsh.read] if suffix == ".msh" and _is_gmsh(path) else _readers(suffix, ask.vtk)
     if not readers:
         raise Trouble("suffix", _unknown(path, suffix))
     if suffix == ".xdmf":
@@ -122,7 +127,7 @@ def read(path: Path, ask: Ask, said: Callable[[], str]) -> Content:
             missing.append(NEED.get(name, name))
             continue
         except Trouble as e:
-            if e.kind in ("asked", "large"):
+            if e.kind in ("asked", "large", "malformed"):
                 raise
             failed.append(e)
             continue

@@ -16,7 +16,7 @@ from .content import Content, Trouble
 
 LEAST = 2 << 30  # bytes that any file may take
 TIMES = 200  # what a byte of a file may take, if that is more
-SECONDS = 30.0  # of computing, for any file
+SECONDS = 15.0  # of computing, for any file
 SPEED = 1e5  # bytes a second, above that
 # What a byte can come to by each of VTK's compressors, at most: by their formats.
 _RATIO = {

@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import cells as zoo
 from . import polyhedra
-from .content import Content, Part, Trouble, is_solid, join, pick_blocks
+from .content import NOT_DRAWN, Content, Part, Trouble, is_solid, join, pick_blocks
 
 # VTK's numbers, in the names of meshio, which `cells` knows.
 NAMES = {
@@ -32,7 +32,6 @@ NAMES = {
     80: "bezier wedge", 81: "bezier pyramid",
 }  # fmt: skip
 GHOSTS = "vtkGhostType"
-_NOT_DRAWN = {"cell": 1 | 8 | 32, "point": 2}  # duplicate, refined and hidden cells; hidden points
 _CUT = (15, 16, 42)  # what `polyhedra` cuts
 VOXEL_BYTES = 700  # what a cell of a structured grid comes to when it is cut into tetrahedra
 
@@ -171,9 +170,9 @@ def _drawn(
 ) -> np.ndarray:
     drawn = np.ones(len(kinds), bool)
     if cell is not None:
-        drawn &= cell & _NOT_DRAWN["cell"] == 0
+        drawn &= cell & NOT_DRAWN["cell"] == 0
     if point is not None:
-        hidden = np.flatnonzero(point & _NOT_DRAWN["point"])
+        hidden = np.flatnonzero(point & NOT_DRAWN["point"])
         drawn[np.repeat(np.arange(len(kinds)), sizes)[np.isin(nodes, hidden)]] = False
     return drawn
 
@@ -192,7 +191,7 @@ def _parts(content: Content, grid: Any, point_ghosts: Any, cell_ghosts: Any) -> 
     offsets = numpy_of(grid.GetCells().GetOffsetsArray()).astype(np.int64)
     sizes = np.diff(offsets)
     if len(sizes) != len(kinds) or (sizes < 0).any() or offsets[-1:].sum() > len(nodes):
-        raise Trouble("damaged", "The offsets of its cells do not fit their number.")
+        raise Trouble("malformed", "The offsets of its cells do not fit their number.")
     drawn = _drawn(kinds, sizes, nodes, point_ghosts, cell_ghosts)
     numbers, first = np.unique(kinds, return_index=True)
     for number in numbers[np.argsort(first)].tolist():
@@ -202,7 +201,7 @@ def _parts(content: Content, grid: Any, point_ghosts: Any, cell_ghosts: Any) -> 
         name = NAMES.get(number, f"VTK {number}")
         if number in _CUT:
             tets, parent = polyhedra.cut(
-                content, [_faces(grid, number, c, nodes, offsets) for c in these], these
+                content, [_faces(grid, number, int(c), nodes, offsets) for c in these], these
             )
             content.parts.append(Part("polyhedron parts", tets))
             rows.append(these[parent])
@@ -225,7 +224,7 @@ def _require_size(name: str, sizes: np.ndarray, these: np.ndarray) -> None:
     if bad.any():
         k = int(np.argmax(bad))
         raise Trouble(
-            "damaged",
+            "malformed",
             f"{int(bad.sum())} of {len(sizes)} {name} cells have another number of nodes than "
             f"{width or kind.n_corners}: the first is cell {these[k]} with {sizes[k]}. Their types "
             "or their offsets are wrong.",

@@ -12,6 +12,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ def write(
     import meshio
 
     file = Path(path)
-    data = (
+    data: dict[str, Any] = (
         {"point_data": {name: values}} if location == "point" else {"cell_data": {name: [values]}}
     )
     mesh = meshio.Mesh(points, [("tetra", tets)], **data)
