@@ -151,7 +151,7 @@ def threads(seconds: float) -> dict[str, Any]:
             rng = np.random.default_rng(k)
             while time.monotonic() < stop:
                 n = int(rng.integers(1, 5))
-                mesh = jaxvr.datasets.box((n, 2, 2), jitter=0.2, seed=int(rng.integers(1e6)))
+                mesh = jaxvr.datasets.box((n, 2, 2), jitter=0.2, seed=int(rng.integers(1_000_000)))
                 path = Path(root) / f"{k}.{'vtu' if rng.random() < 0.5 else 'vtk'}"
                 jaxvr.write_mesh(path, mesh)
                 back = jaxvr.read_mesh(path)
@@ -285,7 +285,7 @@ def disks() -> dict[str, str]:
 
 
 def main(argv: list[str] | None = None) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--mutants", type=int, default=10_000)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--kills", type=int, default=200)

@@ -61,7 +61,7 @@ def truth_of(grid: Any) -> Any:
 def compare(mesh: jaxvr.TetMesh, truth: Any, tolerance: float = TOLERANCE) -> str | None:
     """What is wrong with a mesh, or None. tolerance: of the volume."""
     import vtk
-    from vtk.util.numpy_support import vtk_to_numpy
+    from vtkmodules.util.numpy_support import vtk_to_numpy
 
     sizes = vtk.vtkCellSizeFilter()
     sizes.SetInputData(truth)
@@ -171,7 +171,7 @@ def public(names: str) -> list[dict[str, str]]:
 
 
 def main(argv: list[str] | None = None) -> list[dict[str, str]]:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, help="folder for files.md")
     parser.add_argument("--only", default="", help="kinds with this in their name")
     arguments = parser.parse_args(argv)

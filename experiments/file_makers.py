@@ -8,6 +8,7 @@ truth: a VTK grid, or a function that gives one. Fields are linear (t, v) or dif
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -506,8 +507,7 @@ def _exodus_blocks(place: Path) -> Made:
 
 
 def _exodus_file(path: Path) -> tuple[Any, Any]:
-    import netCDF4
-
+    netCDF4: Any = importlib.import_module("netCDF4")
     grid = tetrahedra(1)
     cells = grid.cell_connectivity.reshape(-1, 4)
     halves_ = [cells[:2], cells[2:]]
@@ -733,8 +733,7 @@ def _gzip(place: Path) -> Made:
 
 def gmsh_box(order: int = 1, groups: bool = False) -> Any:
     """A model of two boxes, meshed; the caller ends gmsh."""
-    import gmsh
-
+    gmsh: Any = importlib.import_module("gmsh")
     gmsh.initialize(interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.option.setNumber("Mesh.MeshSizeMax", 0.7)

@@ -6,6 +6,7 @@ each, coordinates, and variables by step on nodes and on the elements of some of
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,7 @@ def read(path: Path, ask: Ask, said: Any = None, suffix: str = "") -> Content:
     with open(path, "rb") as f:
         classic = f.read(3) == b"CDF"
     try:
-        import netCDF4
-
+        netCDF4: Any = importlib.import_module("netCDF4")
         data = netCDF4.Dataset(str(path))
         data.set_auto_mask(False)
     except ImportError:

@@ -207,7 +207,8 @@ def _xdmf_series(path: Path, ask: Ask) -> Content | None:
             times = [float(k) for k in range(reader.num_steps)]
         step = pick_step(tuple(times), ask.step)
         _, point, cell, *_ = reader.read_data(step)
-    content = content_of(meshio.Mesh(points, cells, point_data=point, cell_data=cell))
+    make: Any = meshio.Mesh
+    content = content_of(make(points, cells, point_data=point, cell_data=cell))
     if len(times) > 1:
         content.steps, content.step = tuple(times), step
     return content
