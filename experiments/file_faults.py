@@ -113,7 +113,9 @@ def mutants(count: int, seed: int) -> dict[str, Any]:
             place = Path(root) / str(len(sources))
             place.mkdir()
             try:
-                made = kind.make(place)
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    made = kind.make(place)
             except Exception as e:
                 print(f"left out: {kind.name} ({type(e).__name__}: {e})")
                 continue

@@ -155,7 +155,7 @@ def list_fields(path: Any, *, max_memory: Any = _DEFAULT) -> list[Field]:
 
     Each is a named tuple of its name, location ("point", "cell" or "corner"), number of components,
     the names of the blocks that have it (where the file has several) and the times of its steps
-    (where it has several). Arguments and errors are those of `read_mesh`.
+    (where it has several). `path`, `max_memory` and errors are those of `read_mesh`.
     """
     return _run("fields", _existing(path), max_memory, None, None)
 

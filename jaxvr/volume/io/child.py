@@ -101,6 +101,7 @@ class _Limits:
         self.resource = resource
         if memory is not None and (used := _address_space()) is not None:
             self._set(resource.RLIMIT_AS, used + memory)
+            self._set(resource.RLIMIT_FSIZE, 64 << 20)  # what readers print is in a file in memory
         if seconds is not None:
             usage = resource.getrusage(resource.RUSAGE_SELF)
             self._set(resource.RLIMIT_CPU, int(usage.ru_utime + usage.ru_stime + seconds) + 1)

@@ -16,68 +16,7 @@ from typing import Any
 import numpy as np
 
 from .content import Ask, Content, Part, Trouble, is_solid, pick_step, require_blocks
-
-# number: (name, nodes). Corners come first.
-TYPES = {
-    1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4), 5: ("hexahedron", 8),
-    6: ("wedge", 6), 7: ("pyramid", 5), 8: ("line3", 3), 9: ("triangle6", 6), 10: ("quad9", 9),
-    11: ("tetra10", 10), 12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14),
-    15: ("vertex", 1), 16: ("quad8", 8), 17: ("hexahedron20", 20), 18: ("wedge15", 15),
-    19: ("pyramid13", 13), 20: ("triangle9", 9), 21: ("triangle10", 10), 22: ("triangle12", 12),
-    23: ("triangle15", 15), 24: ("triangle15", 15), 25: ("triangle21", 21), 26: ("line4", 4),
-    27: ("line5", 5), 28: ("line6", 6), 29: ("tetra20", 20), 30: ("tetra35", 35),
-    31: ("tetra56", 56), 36: ("quad16", 16), 37: ("quad25", 25), 38: ("quad36", 36),
-    90: ("wedge40", 40), 91: ("wedge75", 75), 92: ("hexahedron64", 64), 93: ("hexahedron125", 125),
-    118: ("pyramid30", 30), 119: ("pyramid55", 55),
-}  # fmt: skip
-
-
-class _Stream:
-    """Numbers of one section, text or binary. Raises Trouble behind its end."""
-
-    def __init__(self, raw: bytes, name: str, binary: bool, order: str, size: int):
-        self.name, self.binary, self.order, self.size = name, binary, order, size
-        self.raw, self.at = raw, 0
-        self.words: list[bytes] | None = None if binary else raw.split()
-        self.left = len(raw) if binary else len(self.words or ())
-
-    def _take(self, n: int, dtype: str, width: int) -> np.ndarray:
-        cost = n * width if self.binary else n
-        if n < 0 or cost > self.left:
-            left = self.left // width if self.binary else self.left
-            raise Trouble(
-                "damaged",
-                f"${self.name} asks for {n} numbers where {left} are left: it is cut short, or its "
-                "counts are wrong",
-            )
-        self.left -= cost
-        try:
-            if self.binary:
-                out = np.frombuffer(self.raw, self.order + dtype, n, self.at)
-                self.at += cost
-                return out
-            assert self.words is not None
-            words = self.words[self.at : self.at + n]
-            self.at += n
-            if dtype == "f8":
-                return np.array([float(w) for w in words])
-            return np.array([int(w) for w in words], np.int64)
-        except (ValueError, OverflowError) as e:
-            raise Trouble("damaged", f"${self.name}: {e}") from None
-
-    def ints(self, n: int) -> np.ndarray:
-        return self._take(n, "i4", 4).astype(np.int64)
-
-    def sizes(self, n: int) -> np.ndarray:
-        """Numbers of size_t (version 4.1) or unsigned long (4.0)."""
-        got = self._take(n, "u8" if self.size == 8 else "u4", self.size)
-        return got.astype(np.int64)
-
-    def floats(self, n: int) -> np.ndarray:
-        return self._take(n, "f8", 8)
-
-    def table(self, rows: int, columns: int) -> np.ndarray:
-        return self.ints(rows * columns).reshape(rows, columns)
+from .gmsh_stream import TYPES, Stream
 
 
 @dataclasses.dataclass
@@ -172,8 +111,8 @@ def _line(body: bytes) -> tuple[bytes, bytes]:
     return head, rest
 
 
-def _stream(file: _File, name: str, body: bytes) -> _Stream:
-    return _Stream(body, name, file.binary, file.order, file.size)
+def _stream(file: _File, name: str, body: bytes) -> Stream:
+    return Stream(body, name, file.binary, file.order, file.size)
 
 
 def _integer(text: bytes, name: str) -> int:
@@ -195,7 +134,7 @@ def _nodes(file: _File, name: str, body: bytes) -> None:
             rows = np.frombuffer(rest, kind, n)
             file.node_ids, file.points = rows["id"].astype(np.int64), rows["x"].copy()
         else:
-            numbers = _Stream(rest, name, False, "", 8).floats(4 * n).reshape(n, 4)
+            numbers = Stream(rest, name, False, "", 8).floats(4 * n).reshape(n, 4)
             file.node_ids, file.points = _whole(numbers[:, 0], name), numbers[:, 1:].copy()
         return
     s = _stream(file, name, body)
@@ -211,7 +150,7 @@ def _nodes(file: _File, name: str, body: bytes) -> None:
             points.append(s.floats(n * (3 + extra)).reshape(n, -1)[:, :3])
         elif file.binary:
             width = np.dtype([("id", file.order + "i4"), ("x", file.order + "f8", 3 + extra)])
-            raw = s._take(n * width.itemsize, "u1", 1)
+            raw = s.take(n * width.itemsize, "u1", 1)
             rows = np.frombuffer(raw.tobytes(), width, n)
             ids.append(rows["id"].astype(np.int64))
             points.append(rows["x"][:, :3])
@@ -232,7 +171,7 @@ def _whole(numbers: np.ndarray, name: str) -> np.ndarray:
     return ids
 
 
-def _bounded(n: Any, s: _Stream, name: str) -> int:
+def _bounded(n: Any, s: Stream, name: str) -> int:
     if not 0 <= n <= s.left:
         raise Trouble("damaged", f"${name} counts {n} blocks in {s.left} numbers")
     return int(n)
@@ -366,7 +305,7 @@ def _data(file: _File, name: str, body: bytes) -> None:
     if name != "ElementNodeData":
         if file.binary:
             kind = np.dtype([("id", file.order + "i4"), ("v", file.order + "f8", width)])
-            raw = s._take(n * kind.itemsize, "u1", 1)
+            raw = s.take(n * kind.itemsize, "u1", 1)
             rows = np.frombuffer(raw.tobytes(), kind, n)
             ids, values = rows["id"].astype(np.int64), rows["v"].reshape(n, width)
         else:
