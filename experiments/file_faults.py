@@ -110,7 +110,7 @@ def mutants(count: int, seed: int) -> dict[str, Any]:
         for kind in file_makers.KINDS:
             if kind.name not in SOURCES:
                 continue
-            place = Path(root) / str(len(sources))
+            place = Path(root) / f"{len(sources)} {kind.name}".replace("/", " ")
             place.mkdir()
             try:
                 with warnings.catch_warnings():
