@@ -58,7 +58,9 @@ def info(arguments: Any) -> None:
         print("fields")
         for f in fields:
             size = "" if f.components == 1 else f", {f.components} components"
-            print(f"  {f.name} ({f.location}{size})")
+            steps = f", {len(f.steps)} steps" if f.steps else ""
+            blocks = f", blocks {', '.join(f.blocks)}" if f.blocks else ""
+            print(f"  {f.name} ({f.location}{size}{steps}{blocks})")
     print(_mesh(arguments).describe())
 
 
@@ -151,7 +153,10 @@ def fast_schedule(iterations: int) -> dict[str, Any]:
 def _mesh(arguments: Any) -> TetMesh:
     if _is_plot3d(arguments):
         return read_plot3d(arguments.file, arguments.q, field=arguments.field)
-    return read_mesh(arguments.file, field=arguments.field)
+    step = arguments.step
+    if step is not None:
+        step = int(step) if step.lstrip("-").isdecimal() else float(step)
+    return read_mesh(arguments.file, field=arguments.field, step=step, block=arguments.block)
 
 
 def _is_plot3d(arguments: Any) -> bool:
@@ -186,8 +191,10 @@ def _parser() -> argparse.ArgumentParser:
     def command(name: str, run: Any, about: str) -> argparse.ArgumentParser:
         made = commands.add_parser(name, help=about, description=about)
         made.set_defaults(run=run)
-        made.add_argument("file", metavar="FILE", help="a mesh file that meshio reads, or PLOT3D")
+        made.add_argument("file", metavar="FILE", help="a mesh file, or PLOT3D")
         made.add_argument("--field", help="its field (name, name.x, name.magnitude)")
+        made.add_argument("--step", help="its time step: an index, or a time with a point (0.5)")
+        made.add_argument("--block", help="one of its blocks, by name")
         made.add_argument("--q", metavar="FILE", help="the PLOT3D solution of a PLOT3D grid")
         return made
 

@@ -17,6 +17,7 @@ from experiments import (
     beside_vtk,
     control_points,
     demo,
+    file_faults,
     fit_transfer,
     flat_cells,
     full_vs_partial,
@@ -231,6 +232,15 @@ def beside_vtk_error(folder: Path) -> float:
     return beside_vtk.main(["--tiny", "--out", str(folder)])["rows"][0]["max"]
 
 
+def file_faults_wrong(folder: Path) -> float:
+    """Of mutated files and of threads side by side."""
+    found = file_faults.mutants(60, 0)["outcomes"]
+    bad = [k for k in found if not k.startswith(("error:", "a mesh"))]
+    side_by_side = file_faults.threads(1.0)
+    assert sum(found.values()) == 60 and side_by_side["written and read"] > 0
+    return len(bad) + len(side_by_side["wrong"])
+
+
 EXPERIMENTS = [
     (beside_vtk_error, 0, 0.1),
     (flat_cells_error, 1e-9, 1e-6),
@@ -254,6 +264,7 @@ EXPERIMENTS = [
     (units_range, 98, 100),
     (library_faults_good, 0.999, 1.001),
     (mesh_faults_wrong, -1, 1),
+    (file_faults_wrong, -1, 1),
 ]
 
 

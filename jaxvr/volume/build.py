@@ -186,6 +186,7 @@ class Built:
     all_tetra: bool
     block_sizes: tuple[tuple[str, int], ...]
     report: MeshReport
+    mixed: int = 0  # cells of the zoo that lie the other way round than most of their type
 
 
 def _input_name(i: int, blocks: list[Block]) -> str:
@@ -284,10 +285,13 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
     welded, duplicates = weld(pts)
 
     tets, parent, sizes, sign, start = [], [], [], [], 0
+    zoo_signs = []
     for b in blocks:
         t, p, volume, s = _cut(pts, welded, b.kind, b.corners)
         if b.kind is not zoo.TETRA:
-            _require_order(pts, welded, b, _twisted(p, volume, s, len(b.corners)))
+            counts = _twisted(p, volume, s, len(b.corners))
+            _require_order(pts, welded, b, counts)
+            zoo_signs.append(counts)
         # two node orders are in use for wedges (see cells.WEDGE); the sign of most tells which
         if b.kind is zoo.WEDGE and int(s.sum(dtype=np.int64)) < 0:
             s, volume = -s, -volume
@@ -359,4 +363,35 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
         all_tetra=all(b.kind is zoo.TETRA for b in blocks if len(b.corners)),
         block_sizes=tuple((b.name, len(b.corners)) for b in blocks),
         report=report,
+        mixed=sum(min(up, down) for _, up, down in zoo_signs),
     )
+
+
+# A file of which more than this part would have to be repaired is not what it seems.
+_REPAIRED = 0.1
+
+
+def require_sound(built: Built) -> None:
+    """ValueError where repairs touch more than a tenth of a mesh: cells dropped as all of their
+    tetrahedra repeat a point or stand three to a face, cells of the zoo turned round among others
+    of their type that lie right, tetrahedra that overlap their neighbours.
+
+    Which way round tetrahedra are written, and a mesh that lies the other way round as a whole,
+    are conventions; so are hexahedra with an edge or a face in one point, while part of them is
+    left.
+    """
+    n, report = built.n_input, built.report
+    lost = n - len(np.unique(built.parent))
+    found = (
+        (lost, n, "cells repeat points or stand three to a face, and nothing is left of them"),
+        (built.mixed, n, "cells are turned inside out, among others of their type that are not"),
+        (report.folded, report.tets, "tetrahedra overlap their neighbours"),
+    )
+    for count, of, what in found:
+        if count > _REPAIRED * of:
+            raise ValueError(
+                f"{count} of {of} {what}: with repairs in more than a tenth of it, the mesh would "
+                "not be the one that was meant. The order of the nodes in its cells is probably "
+                "another one, or points and cells do not belong together. If it is right, pass its "
+                "arrays to TetMesh.from_cells, which repairs with a warning."
+            )

@@ -96,14 +96,24 @@ _ALIASES = {
     "biquadraticquadraticwedge": "wedge18", "quadraticpyramid": "pyramid13",
     "triquadraticpyramid": "pyramid19", "lagrangetetrahedron": "tetra",
     "lagrangehexahedron": "hexahedron", "lagrangewedge": "wedge", "lagrangepyramid": "pyramid",
+    "polyhedronparts": "tetra",  # what `io.polyhedra` makes
     "10": "tetra", "11": "voxel", "12": "hexahedron", "13": "wedge", "14": "pyramid",
     "24": "tetra10", "25": "hexahedron20", "26": "wedge15", "27": "pyramid13",
-    "29": "hexahedron27", "32": "wedge18",
+    "29": "hexahedron27", "31": "wedge12", "32": "wedge18", "33": "hexahedron24", "37": "pyramid19",
+    "quadraticlinearwedge": "wedge12", "biquadraticquadratichexahedron": "hexahedron24",
 }  # fmt: skip
+# VTK's cells of any order, by number: Lagrange's, and Bezier's, whose corners are such too.
+_HIGH = {
+    str(first + k): f"lagrange{name}"
+    for first in (68, 75)
+    for k, name in enumerate(
+        ("curve", "triangle", "quadrilateral", "tetrahedron", "hexahedron", "wedge", "pyramid")
+    )
+}
 _FLAT = re.compile(
     r"(empty|vertex|polyvertex|line|polyline|curve|edge|triangle|trianglestrip|quad|pixel|polygon"
     r"|lagrangecurve|lagrangetriangle|lagrangequadrilateral|quadratic(edge|triangle|quad)"
-    r"|biquadratic(triangle|quad)|[0-9]$|2[123]$)\d*$"
+    r"|biquadratic(triangle|quad)|[0-9]$|2[1238]$|3[0456]$)\d*$"
 )
 _SOLID = re.compile(r"(tetra|hexahedron|wedge|pyramid)(\d*)$")
 _VOXEL = (0, 1, 3, 2, 4, 5, 7, 6)  # VTK's voxel counts x fastest; as a hexahedron
@@ -120,6 +130,7 @@ def canonical(name: Any) -> tuple[CellKind | None, int | None, tuple[int, ...] |
     word = re.sub(r"[_\s-]", "", str(name).lower())
     full = word
     word = word.removeprefix("vtk")
+    word = _HIGH.get(word, word).replace("bezier", "lagrange")
     lagrange = word.startswith("lagrange")
     word = _ALIASES.get(word, word)
     if word == "voxel":

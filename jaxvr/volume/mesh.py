@@ -13,7 +13,7 @@ import numpy as np
 
 from .._core.checks import as_floats, is_concrete, require_finite, require_shape
 from .._core.pytree import pytree, static
-from .build import build
+from .build import build, require_sound
 from .integrity import require_connectivity, trust, trust_entries
 from .mirror import mirrored
 from .report import MeshReport
@@ -119,7 +119,7 @@ class TetMesh:
 
         The field has the name it was read by, or "values". Corner data becomes point data on points
         of each tetrahedron's own; `from_pyvista` welds those, so faces and pictures are the same.
-        Needs PyVista: `pip install 'jaxvr[peers]'`.
+        Needs PyVista: `pip install pyvista`.
         """
         from .vtk_grid import write_grid
 
@@ -231,9 +231,13 @@ def _from_cells(
     field: str | None,
     stacklevel: int,
     flat_before: bool = False,
+    strict: bool = False,
 ) -> TetMesh:
-    """flat_before: flat cells among these have been warned of."""
+    """flat_before: flat cells among these have been warned of. strict: the cells come from a file
+    or another program, and repairs of more than a tenth of them are an error."""
     built = build(points, cells, dtype, field)
+    if strict:
+        require_sound(built)
     placed, where = place(values, built, location)
     news = dataclasses.replace(built.report, flat=0) if flat_before else built.report
     for message in (news.warning(), rounded("values", values, placed.dtype)):

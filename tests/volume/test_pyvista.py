@@ -95,7 +95,10 @@ def test_errors_say_what_there_is():
     points = zoo_grid().points[:8]
     poly = pyvista.UnstructuredGrid([len(cube) - 1, *cube[1:]], [42], points)
     poly.point_data["t"] = np.arange(8.0)
-    with pytest.raises(ValueError, match="'polyhedron' are not supported"):
+    mesh = TetMesh.from_pyvista(poly)
+    assert mesh.n_tets == 12 and mesh.report.input_cells == (("polyhedron parts", 12),)
+    poly.points[6] = 0.3, 0.3, 0.3
+    with pytest.raises(ValueError, match="1 of 1 polyhedra are not convex.*cells 0"):
         TetMesh.from_pyvista(poly)
 
 

@@ -107,7 +107,7 @@ def test_missing_fields_list_those_there_are(sample, field, message):
 
 def test_bad_location(sample):
     with pytest.raises(ValueError, match="location must be"):
-        read_mesh(sample[0], location="corner")
+        read_mesh(sample[0], location="middle")
     with pytest.raises(ValueError, match="no cell field 't'"):
         read_mesh(sample[0], "t", location="cell")
 

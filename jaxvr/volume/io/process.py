@@ -1,0 +1,122 @@
+"""The processes that read and write files for this one: started when needed, kept for a while.
+
+At most `MOST` work at a time, whatever the number of threads; the others wait. A process that is
+idle for two minutes ends by itself, and all end with this one. One that a file ended (a crash of
+the reader, memory, time) is told as such, and the next file gets a new one.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from . import child
+from .content import Trouble
+
+MOST = 4
+KEPT = 2  # idle ones
+_CHILD = Path(child.__file__)
+
+
+class _Pool:
+    def __init__(self) -> None:
+        self.pid = os.getpid()
+        self.idle: list[subprocess.Popen[bytes]] = []
+        self.lock = threading.Lock()
+        self.places = threading.BoundedSemaphore(MOST)
+
+
+_pool = _Pool()
+
+
+def _start() -> subprocess.Popen[bytes]:
+    if not sys.executable:
+        raise Trouble(
+            "system", "Files are read in a process of its own, and Python cannot start one."
+        )
+    window = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # Windows opens one otherwise
+    return subprocess.Popen(
+        [sys.executable, "-I", "-W", "ignore", str(_CHILD)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        creationflags=window,
+    )
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+    for stream in (process.stdin, process.stdout):
+        try:
+            if stream is not None:
+                stream.close()
+        except OSError:
+            pass  # what was not written any more
+
+
+@atexit.register
+def _end_all() -> None:
+    if _pool.pid == os.getpid():
+        while _pool.idle:
+            _end(_pool.idle.pop())
+
+
+def run(job: str, memory: int | None, seconds: float | None, **arguments: Any) -> Any:
+    """What the function `job` of `jobs` returns for these arguments. Raises Trouble.
+
+    memory: bytes that it may take; seconds: of computing.
+    """
+    global _pool
+    if _pool.pid != os.getpid():  # forked: the pipes are another's
+        _pool = _Pool()
+    pool = _pool
+    settings = {"path": sys.path, "memory": memory, "seconds": seconds}
+    with pool.places:
+        for tries_left in (1, 0):  # an idle one may have ended meanwhile
+            with pool.lock:
+                process = pool.idle.pop() if pool.idle and tries_left else None
+            fresh = process is None
+            process = _start() if process is None else process
+            whole = taken = False
+            try:
+                assert process.stdin is not None and process.stdout is not None
+                child.send(process.stdin, (job, arguments, settings))
+                taken = process.stdout.read(1) == child.TAKEN
+                if taken:
+                    answer = child.receive(process.stdout)
+                    whole = answer[:2] != ("trouble", "large")  # it may be short of more
+                    break
+                raise EOFError
+            except (EOFError, OSError):
+                if taken or fresh:
+                    raise _gone(process) from None
+            finally:
+                with pool.lock:
+                    keep = whole and len(pool.idle) < KEPT
+                    if keep:
+                        pool.idle.append(process)
+                if not keep:
+                    _end(process)
+    if answer[0] == "trouble":
+        raise Trouble(*answer[1:])
+    return answer[1]
+
+
+def _gone(process: subprocess.Popen[bytes]) -> Trouble:
+    """Why a process that had taken a request is not there any more."""
+    try:
+        code = process.wait(timeout=10)
+    except subprocess.TimeoutExpired:
+        return Trouble("system", "The process that reads files does not answer.")
+    if -code in (getattr(signal, "SIGXCPU", 0), getattr(signal, "SIGPROF", 0)) and code:
+        return Trouble("slow", "")
+    if code in (-signal.SIGABRT, -getattr(signal, "SIGKILL", 9)):  # C++'s std::bad_alloc aborts
+        return Trouble("large", "")
+    return Trouble("crashed", f"the reader crashed (exit code {code})")

@@ -1,0 +1,181 @@
+"""Files that VTK's own readers take: a table from suffixes to classes, and what to switch on.
+
+Where VTK prints an error, the file counts as damaged, whatever came out. Displacements are not
+added to the points of Exodus files, and OpenFOAM's cell data are not averaged to points: what is in
+the file is what is read.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from .content import Ask, Content, Trouble, pick_step
+from .vtk_data import content_of
+
+# suffix: module of vtkmodules, class
+READERS = {
+    ".vtu": ("vtkIOXML", "vtkXMLUnstructuredGridReader"),
+    ".vti": ("vtkIOXML", "vtkXMLImageDataReader"),
+    ".vtr": ("vtkIOXML", "vtkXMLRectilinearGridReader"),
+    ".vts": ("vtkIOXML", "vtkXMLStructuredGridReader"),
+    ".vtp": ("vtkIOXML", "vtkXMLPolyDataReader"),
+    ".pvtu": ("vtkIOXML", "vtkXMLPUnstructuredGridReader"),
+    ".pvti": ("vtkIOXML", "vtkXMLPImageDataReader"),
+    ".pvtr": ("vtkIOXML", "vtkXMLPRectilinearGridReader"),
+    ".pvts": ("vtkIOXML", "vtkXMLPStructuredGridReader"),
+    ".vtm": ("vtkIOXML", "vtkXMLMultiBlockDataReader"),
+    ".vtmb": ("vtkIOXML", "vtkXMLMultiBlockDataReader"),
+    ".vtpd": ("vtkIOXML", "vtkXMLPartitionedDataSetReader"),
+    ".vtpc": ("vtkIOXML", "vtkXMLPartitionedDataSetCollectionReader"),
+    ".vtk": ("vtkIOLegacy", "vtkGenericDataObjectReader"),
+    ".vtkhdf": ("vtkIOHDF", "vtkHDFReader"),
+    ".hdf": ("vtkIOHDF", "vtkHDFReader"),
+    ".cgns": ("vtkIOCGNSReader", "vtkCGNSReader"),
+    ".e": ("vtkIOExodus", "vtkExodusIIReader"),
+    ".case": ("vtkIOEnSight", "vtkGenericEnSightReader"),
+    ".foam": ("vtkIOGeometry", "vtkOpenFOAMReader"),
+    ".dat": ("vtkIOGeometry", "vtkTecplotReader"),
+    ".neu": ("vtkIOGeometry", "vtkGAMBITReader"),
+    ".cas": ("vtkIOGeometry", "vtkFLUENTReader"),
+    ".avs": ("vtkIOGeometry", "vtkAVSucdReader"),
+    ".xdmf": ("vtkIOXdmf2", "vtkXdmfReader"),
+}
+SAME = {
+    ".ex2": ".e", ".exo": ".e", ".exii": ".e", ".g": ".e", ".encas": ".case", ".tec": ".dat",
+    ".tp": ".dat", ".ucd": ".avs", ".xmf": ".xdmf",
+}  # fmt: skip
+_TROUBLE = re.compile(r"(?:ERR\||ERROR: In|Error:|Generic Warning: In.*(?:[Ee]rror|[Uu]nable))")
+
+
+def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
+    """One of the files of `READERS`. Raises ImportError without VTK."""
+    suffix = SAME.get(suffix, suffix)
+    if suffix == ".e" and b"dim_nod_var" in path.read_bytes():
+        # meshio's Exodus files: VTK takes other numbers for their values, without a word
+        raise ImportError("netCDF4", name="netCDF4")
+    module, name = READERS[suffix]
+    reader = getattr(importlib.import_module(f"vtkmodules.{module}"), name)()
+    if suffix == ".case":
+        reader.SetCaseFileName(str(path))
+    else:
+        reader.SetFileName(str(path))
+    if suffix == ".vtk":
+        for what in (
+            "Scalars",
+            "Vectors",
+            "Normals",
+            "Tensors",
+            "ColorScalars",
+            "TCoords",
+            "Fields",
+        ):
+            getattr(reader, f"ReadAll{what}On")()
+    if suffix == ".dat":
+        _require_soon(2 + path.stat().st_size / 5e5)
+    reader.UpdateInformation()
+    steps = _times(reader)
+    _switch_on(reader, suffix)
+    step = None
+    if steps:
+        step = pick_step(steps, ask.step)
+        reader.UpdateTimeStep(steps[step])
+    else:
+        reader.Update()
+    if suffix == ".dat" and hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_PROF, 0)
+    data = reader.GetOutputDataObject(0)
+    told = " ".join(said().split())
+    found = _TROUBLE.search(told)
+    if found:
+        raise Trouble("damaged", f"{name}: {_plain(told[found.start() :])}")
+    content = content_of(data, ask.block, ask.limit, path.name)
+    content.reader = name
+    content.steps = steps if len(steps) > 1 else ()
+    content.step = step if len(steps) > 1 else None
+    if suffix == ".vtk":
+        content.active = []  # that is the last of those that were read
+    if told:
+        content.notes.append(f"{name} says: {_plain(told)}")
+    return content
+
+
+def _require_soon(seconds: float) -> None:
+    """VTK's Tecplot reader waits for ever for what a file cut short does not have: it gets less
+    time than others, after which this process is ended."""
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGPROF, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_PROF, seconds)
+
+
+def _plain(told: str) -> str:
+    """VTK's messages without time stamps, addresses and places in its source."""
+    told = re.sub(r"\(\s*[0-9.]+s\)\s*\[[^\]]*\]\s*", "", told)
+    told = re.sub(r"\S+\.cxx:\d+\s*(ERR|WARN)\|\s*", "", told)
+    told = re.sub(r"\((?:0x)?[0-9a-f]{6,}\)", "", told)
+    return told[:300]
+
+
+def _times(reader: Any) -> tuple[float, ...]:
+    executive = reader.GetExecutive()
+    information = executive.GetOutputInformation(0)
+    key = executive.TIME_STEPS()
+    return tuple(information.Get(key)) if information.Has(key) else ()
+
+
+def _switch_on(reader: Any, suffix: str) -> None:
+    """All that the file has, and nothing made of it."""
+    if suffix == ".e":
+        reader.ApplyDisplacementsOff()
+        reader.GenerateObjectIdCellArrayOff()
+        for kind in (reader.ELEM_BLOCK, reader.NODAL):
+            for k in range(reader.GetNumberOfObjectArrays(kind)):
+                reader.SetObjectArrayStatus(kind, reader.GetObjectArrayName(kind, k), 1)
+        for k in range(reader.GetNumberOfObjects(reader.ELEM_BLOCK)):
+            reader.SetObjectStatus(reader.ELEM_BLOCK, k, 1)
+    elif suffix == ".foam":
+        reader.CreateCellToPointOff()
+        reader.EnableAllCellArrays()
+        reader.EnableAllPointArrays()
+    elif suffix == ".cgns":
+        reader.EnableAllBases()
+        reader.EnableAllFamilies()
+        reader.EnableAllPointArrays()
+        reader.EnableAllCellArrays()
+    elif suffix in (".avs", ".dat", ".neu", ".cas", ".case", ".xdmf"):
+        for what in ("Point", "Cell"):
+            for k in range(getattr(reader, f"GetNumberOf{what}Arrays", int)()):
+                name = getattr(reader, f"Get{what}ArrayName")(k)
+                getattr(reader, f"Set{what}ArrayStatus")(name, 1)
+
+
+def members(path: Path, suffix: str) -> list[tuple[float, str, Path]]:
+    """(time, name of the part, file) of each entry of a .pvd or .series file. Raises Trouble."""
+    try:
+        if suffix == ".series":
+            entries = json.loads(path.read_text("utf-8"))["files"]
+            found = [(float(e["time"]), "", path.parent / e["name"]) for e in entries]
+        else:
+            sets = ElementTree.fromstring(path.read_bytes()).iter("DataSet")
+            found = [
+                (
+                    float(e.get("timestep") or 0),
+                    e.get("name") or e.get("part") or "0",
+                    path.parent / e.attrib["file"],
+                )
+                for e in sets
+            ]
+    except (ValueError, KeyError, TypeError, ElementTree.ParseError) as e:
+        raise Trouble("damaged", f"it is no collection of files: {type(e).__name__}: {e}") from None
+    if not found:
+        raise Trouble("damaged", "it lists no files.")
+    for _, _, file in found:
+        if not file.is_file():
+            raise Trouble("damaged", f"it names {file.name!r}, which is not there.")
+    return found
