@@ -158,6 +158,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="jaxvr", description="Differentiable volume rendering of unstructured meshes."
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="of jaxvr, JAX and Python")
     shown = " (%(default)s)"
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
 
@@ -234,6 +235,20 @@ def _parser() -> argparse.ArgumentParser:
     made.add_argument("--quiet", action="store_true", help="no progress bar")
     made.add_argument("-o", "--output", required=True, metavar="FOLDER", help="pictures, report")
     return parser
+
+
+class _Version(argparse.Action):
+    """Tells what somebody who reports a fault is asked for."""
+
+    def __call__(self, parser: Any, *_: Any, **__: Any) -> None:
+        import platform
+
+        import jax
+
+        from jaxvr import __version__
+
+        print(f"jaxvr {__version__} (jax {jax.__version__}, Python {platform.python_version()})")
+        parser.exit()
 
 
 class _Parser(argparse.ArgumentParser):

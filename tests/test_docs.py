@@ -29,7 +29,7 @@ from notebooks.site import collect, listed, public
 
 ROOT = Path(__file__).resolve().parents[1]
 OTHERS = sorted([*ROOT.glob("notebooks/*.md"), *ROOT.glob("experiments/*.md")])
-PAGES = [ROOT / "README.md", *OTHERS]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *OTHERS]
 NOTEBOOKS = sorted(ROOT.glob("notebooks/*.ipynb"))
 GUIDES = [p for p in PAGES if p.parent.name != "experiments"]
 

@@ -12,12 +12,11 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from jaxvr import hints
 from jaxvr._core.checks import require_kind
@@ -43,6 +42,9 @@ from jaxvr.fit.report import FitResult, likeness, number, timing
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.render import render_rays, shade
 from jaxvr.trace import AbstractTracer, Recorded, Segments
+
+if TYPE_CHECKING:  # it takes a while to import
+    import optax
 
 Array = jax.Array
 

@@ -162,8 +162,8 @@ class Camera:
 
         View k has sin(elevation) = 1 - (2k + 1)/n and azimuth k times the golden angle
         (González, "Measurement of areas on a sphere using Fibonacci and latitude-longitude
-        lattices", 2010); no view looks along up. DiffDVR (Weiss and Westermann, 2021) fits to
-        eight such views.
+        lattices", 2010, doi:10.1007/s11004-009-9257-x); no view looks along up. DiffDVR (Weiss and
+        Westermann, 2021, doi:10.1109/TVCG.2021.3114769) fits to eight such views.
         """
         n = _positive("n", n)
         golden = 180.0 * (3.0 - math.sqrt(5.0))
@@ -202,7 +202,7 @@ class Camera:
         """This view as a new vtkCamera, or set in the camera, renderer or plotter `into`.
 
         Returns the vtkCamera. `camera.to_vtk(plotter)` sets a pyvista.Plotter's camera and the size
-        of its window. VTK makes view up a unit vector. Needs VTK: `pip install 'jaxvr[peers]'`.
+        of its window. VTK makes view up a unit vector. Needs VTK: `pip install vtk`.
         """
         from jaxvr.view import camera_vtk
 

@@ -119,7 +119,7 @@ class TetMesh:
 
         The field has the name it was read by, or "values". Corner data becomes point data on points
         of each tetrahedron's own; `from_pyvista` welds those, so faces and pictures are the same.
-        Needs PyVista: `pip install 'jaxvr[peers]'`.
+        Needs PyVista: `pip install pyvista`.
         """
         from .vtk_grid import write_grid
 

@@ -77,7 +77,7 @@ def write_grid(mesh: TetMesh) -> Any:
     try:
         import pyvista
     except ImportError as e:
-        raise ImportError("to_pyvista needs PyVista: pip install 'jaxvr[peers]'") from e
+        raise ImportError("to_pyvista needs PyVista: pip install pyvista") from e
     points, cells, values = (np.array(x) for x in (mesh.points, mesh.cells, mesh.values))
     _, sign = signed_volumes(points, cells)
     order = np.tile(np.arange(4), (len(cells), 1))
