@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 import jaxvr
+import jaxvr.accessors  # which PyVista finds by itself where jaxvr is installed: see test_package
 import jaxvr.plot
 from jaxvr import cli
 from jaxvr.adjoint.base import AbstractAdjoint

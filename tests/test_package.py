@@ -80,7 +80,8 @@ def test_what_the_wheel_says(installed):
     assert says["Requires-Python"] == PROJECT["requires-python"]
     assert "Typing :: Typed" in says.get_all("Classifier", [])
     assert set(says.get_all("Provides-Extra", [])) == set(PROJECT["optional-dependencies"])
-    assert "jaxvr = jaxvr.cli:main" in (about / "entry_points.txt").read_text()
+    points = (about / "entry_points.txt").read_text()
+    assert "jaxvr = jaxvr.cli:main" in points and points.count("jaxvr = jaxvr.accessors") == 2
 
 
 # What `import jaxvr` may load beside Python and JAX.
@@ -117,12 +118,38 @@ def test_the_wheel_works_alone_and_importing_it_loads_little(installed, tmp_path
     assert count < 400, f"import jaxvr loads {count} modules beside those of JAX"
 
 
+ACCESSORS = """
+import sys, warnings
+warnings.simplefilter("ignore", DeprecationWarning)  # in what PyVista imports
+import pyvista
+assert "jaxvr" not in sys.modules
+grid = pyvista.read(sys.argv[1])
+assert "jaxvr" in dir(grid) and "jaxvr" not in sys.modules
+print(grid.jaxvr.mesh("density").n_tets, sys.modules["jaxvr"].__file__)
+print(pyvista.Plotter(off_screen=True).jaxvr)
+"""
+
+
+def test_pyvista_finds_the_accessors_by_itself(installed, tmp_path):
+    """By the entry points of the installed package, with no import of jaxvr, and not before."""
+    box = jaxvr.datasets.box((2, 1, 1)).to_pyvista()
+    box.rename_array("values", "density")
+    box.save(tmp_path / "box.vtu")
+    said = run(installed, "-c", ACCESSORS, str(tmp_path / "box.vtu"), cwd=tmp_path).splitlines()
+    count, place = said[0].split()
+    assert count == "12" and Path(place).is_relative_to(installed)
+    assert said[1] == "jaxvr on a plotter: scene, render, screenshot"
+
+
 SCRIPT = '''
 """A user's script."""
 
+import jax
 import numpy as np
+import pyvista
 
 import jaxvr
+from jaxvr.accessors import GridAccessor
 
 mesh = jaxvr.datasets.box((3, 3, 3))
 camera = jaxvr.Camera.orbit(mesh, azimuth=35, width=16, height=16)
@@ -138,6 +165,11 @@ along = jaxvr.probe(mesh, camera, transfer, (8, 8))
 colors, extinctions = transfer(mesh.values)
 print(np.asarray(image).shape, along[0].lengths, result.loss_history, picture.shape)
 score = jaxvr.psnr(image, shaded)
+
+
+def look(grid: pyvista.UnstructuredGrid) -> jax.Array:
+    on_grid: GridAccessor = grid.jaxvr
+    return on_grid.render("density")
 '''
 TYPES = {
     "mesh": "TetMesh",
@@ -154,6 +186,7 @@ TYPES = {
     "along": "Probe",
     "colors": "Array",
     "score": "Array",
+    "look": "(grid: UnstructuredGrid) -> Array",
 }
 MISTAKES = {
     "jaxvr.render(mesh, transfer, camera)": "reportCallIssue",
@@ -162,34 +195,24 @@ MISTAKES = {
 }
 
 
-@pytest.fixture(scope="module")
-def checked(installed, tmp_path_factory):
-    """Runs pyright, strict, on a script of somebody who has the wheel: [(rule, message), ...]."""
-
-    def check(script: str) -> list[tuple[str, str]]:
-        folder = tmp_path_factory.mktemp("script")
-        (folder / "script.py").write_text(script)
-        strict = {"typeCheckingMode": "strict", "pythonVersion": "3.11"}
-        (folder / "pyrightconfig.json").write_text(json.dumps(strict))
-        command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable]
-        environment = os.environ | {"PYTHONPATH": str(installed)}
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-        found = json.loads(done.stdout)["generalDiagnostics"]
-        return [(d.get("rule", d["severity"]), d["message"]) for d in found]
-
-    return check
-
-
-def test_a_strict_checker_sees_the_types(checked):
+def test_a_strict_checker_sees_types_and_mistakes(installed, tmp_path):
+    """pyright, strict, on a script of somebody who has the wheel."""
     assert len(SCRIPT.strip().splitlines()) >= 20
-    asked = "".join(f"\nreveal_type({name})" for name in TYPES)
-    told = dict.fromkeys(f'Type of "{n}" is "{kind}"' for n, kind in TYPES.items())
-    assert checked(SCRIPT + asked) == [("information", message) for message in told]
-
-
-def test_a_strict_checker_sees_mistakes(checked):
-    rules = [rule for rule, _ in checked(SCRIPT + "\n".join(f"print({m})" for m in MISTAKES))]
-    assert [rule for rule in rules if rule in MISTAKES.values()] == list(MISTAKES.values()), rules
+    asked = [f"reveal_type({name})" for name in TYPES]
+    script = "\n".join([SCRIPT, *asked, *(f"print({m})" for m in MISTAKES)])
+    (tmp_path / "script.py").write_text(script)
+    strict = {"typeCheckingMode": "strict", "pythonVersion": "3.11"}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(strict))
+    command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable]
+    environment = os.environ | {"PYTHONPATH": str(installed)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    found = json.loads(done.stdout)["generalDiagnostics"]
+    told = [d["message"] for d in found if d["severity"] == "information"]
+    assert told == [f'Type of "{name}" is "{kind}"' for name, kind in TYPES.items()]
+    first = len(script.splitlines()) - len(MISTAKES)
+    errors = {(d["range"]["start"]["line"], d["rule"]) for d in found if d["severity"] == "error"}
+    assert {line for line, _ in errors} == set(range(first, first + len(MISTAKES))), done.stdout
+    assert set(enumerate(MISTAKES.values(), first)) <= errors, done.stdout
 
 
 def test_advice_names_what_can_be_installed():
