@@ -20,6 +20,7 @@ compiled loops, which serve where they can with the same results; no other room 
 
 from typing import TYPE_CHECKING
 
+import jaxvr._core.quiet  # noqa: F401, I001 (first, before anything imports JAX)
 from jaxvr import native, order, testing
 from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay
