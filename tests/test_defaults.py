@@ -91,7 +91,7 @@ def test_points_that_no_cell_uses_count_in_no_statistic():
     np.testing.assert_array_equal(a.positions, b.positions)
     np.testing.assert_array_equal(a.extinctions, b.extinctions)
     assert "point data, 0 to 1\n" in other.describe()
-    assert "point data, 0 to 1<" in other._repr_html_()
+    assert "point data, 0 to 1<" in str(other._repr_html_())
     views = [Viewer(m, size=8).setup() for m in (mesh, other)]
     assert views[0]["range"] == views[1]["range"] and views[0]["counts"] == views[1]["counts"]
 

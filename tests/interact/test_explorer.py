@@ -426,5 +426,5 @@ def test_without_anywidget_it_says_what_to_install(mesh, monkeypatch):
 
     monkeypatch.setitem(sys.modules, "anywidget", None)
     monkeypatch.delitem(sys.modules, "jaxvr.interact.widget", raising=False)
-    with pytest.raises(ImportError, match=r"pip install 'jaxvr\[notebooks\]'"):
+    with pytest.raises(ImportError, match=r"pip install anywidget jupyterlab"):
         explore(mesh)
