@@ -9,10 +9,12 @@
 # make clean      remove the environment, caches and outputs
 #
 # PYTHON picks the interpreter (3.11 or newer):  make test PYTHON=python3.12
+# PINS are requirements beside the project's:    make test PINS="jax==0.7 jaxlib==0.7"
 
 PYTHON ?= python3
+PINS ?=
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DELETE_ON_ERROR:
@@ -64,7 +66,7 @@ $(VENV)/.package: pyproject.toml | $(VENV)/.made
 	@touch $@
 
 $(VENV)/.tools: pyproject.toml | $(VENV)/.made
-	$(INSTALL) '.[dev]'
+	$(INSTALL) '.[dev]' $(PINS)
 	@touch $@
 
 $(VENV)/.docs: pyproject.toml | $(VENV)/.made

@@ -3,6 +3,7 @@ and the tests that touch every room with both engines (`pytest -m rooms`, see te
 
     python .ci/pythons.py          # all
     python .ci/pythons.py 3.12     # some
+    python .ci/pythons.py --oldest # prints the oldest JAX that pyproject.toml allows, for pip
 
 The oldest Python has the oldest JAX that pyproject.toml allows, the others have the newest. A
 version is looked for among the commands (python3.12) and in pyenv's folder, and one that is not
@@ -124,4 +125,6 @@ def main(chosen: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    if sys.argv[1:] == ["--oldest"]:
+        sys.exit(print(*floors()))
     sys.exit(main(sys.argv[1:]))

@@ -156,9 +156,18 @@ class Page:
         return self.driver.find_elements("css selector", f".jaxvr-explorer {selector}")
 
     def ready(self) -> bool:
-        """Whether the kernel is there; answers JupyterLab's question which one to take."""
-        for button in self.driver.find_elements("css selector", ".jp-Dialog .jp-mod-accept"):
+        """Whether the kernel is there; answers JupyterLab's question which one to take.
+
+        The shell has a current widget, whose kernel that is, once something in it has the focus: a
+        click on the first cell gives it that.
+        """
+        buttons = self.driver.find_elements("css selector", ".jp-Dialog .jp-mod-accept")
+        for button in buttons:
             button.click()
+        cells = self.driver.find_elements("css selector", ".jp-Notebook .jp-Cell .cm-content")
+        current = "return Boolean(window.jupyterapp?.shell.currentWidget)"
+        if cells and not buttons and not self.driver.execute_script(current):
+            cells[0].click()
         script = "return window.jupyterapp?.shell.currentWidget?.sessionContext?.session?.kernel"
         return self.driver.execute_script(script + "?.connectionStatus === 'connected'")
 

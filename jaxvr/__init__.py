@@ -13,12 +13,14 @@ shade many, since segments do not depend on the transfer function.
 
 Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, `view`, `optics`,
 `order`, `trace`, `composite`, `native`, `adjoint`, `units`, `defaults`, `hints`, `render`, `probe`,
-`fit`, `files`, `testing`, `plot`, `pictures`, `interact`, `cli`. Those of `native` are compiled
-loops, which serve where they can with the same results; no other room imports from `testing`.
+`fit`, `files`, `testing`, `plot`, `pictures`, `interact`, `accessors`, `cli`. Those of `native` are
+compiled loops, which serve where they can with the same results; no other room imports from
+`testing`.
 """
 
 from typing import TYPE_CHECKING
 
+import jaxvr._core.quiet  # noqa: F401, I001 (first, before anything imports JAX)
 from jaxvr import native, order, testing
 from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay

@@ -17,14 +17,16 @@ import numpy as np
 from jaxvr._core.status import RenderError
 from jaxvr._core.warn import warn
 from jaxvr._core.writing import place_of
-from jaxvr.defaults import DEPTH, default_transfer, diagonal
+from jaxvr.defaults import DEPTH, UPS, best_up, default_transfer, diagonal
 from jaxvr.files import image_writer, save_image
 from jaxvr.fit import CheckpointWarning, FitError, fit, noise
 from jaxvr.fit.resume import prepare
+from jaxvr.native import compile_cache
 from jaxvr.optics import TransferFunction
 from jaxvr.render import render
 from jaxvr.view import Camera
 from jaxvr.volume import TetMesh, list_fields, read_mesh, read_plot3d
+from jaxvr.volume.statistics import value_range
 
 _PLOT3D = {".xyz", ".x", ".g", ".grd", ".p3d", ".bin", ".q"}
 
@@ -37,6 +39,8 @@ def main(argv: list[str] | None = None) -> int:
         warnings.showwarning = _tell_once()
         try:
             arguments = parser.parse_args(argv)
+            if arguments.run is not info:
+                compile_cache.switch_on()
             return arguments.run(arguments) or 0
         except SystemExit as e:  # of argparse: --help, or an error that it has told
             return e.code if isinstance(e.code, int) else 2
@@ -68,20 +72,24 @@ def picture(arguments: Any) -> None:
     """One picture of a file."""
     out = Path(arguments.output)
     image_writer(out)  # raises now what would be wrong with the path after all the work
+    if arguments.scalar_bar and out.suffix.lower() != ".png":
+        raise ValueError("--scalar-bar is drawn on a .png; the other formats hold pixels alone.")
     mesh = _mesh(arguments)
     transfer = _transfer(arguments.tf, mesh, arguments)
-    camera = Camera.orbit(
-        mesh,
-        azimuth=arguments.azimuth,
-        elevation=arguments.elevation,
-        fov=arguments.fov,
-        zoom=arguments.zoom,
-        width=arguments.width,
-        height=arguments.height,
-    )
+    camera, view = _camera(mesh, transfer, arguments)
     image = np.asarray(render(mesh, camera, transfer, background=arguments.background))
-    save_image(out, image)
-    print(f"{out}  {image.shape[1]} x {image.shape[0]}, mean alpha {image[..., 3].mean():.3f}")
+    field = mesh.report.field or "values"
+    if arguments.scalar_bar:
+        from jaxvr import plot
+
+        plot.image(image, transfer=transfer, label=field).savefig(out)
+    else:
+        save_image(out, image)
+    low, high = value_range(mesh)
+    first, last = (float(transfer.positions[k]) for k in (0, -1))
+    size = f"{image.shape[1]} x {image.shape[0]}, mean alpha {image[..., 3].mean():.3f}"
+    print(f"{out}  {size}")
+    print(f"field {field}, {low:.6g} to {high:.6g}, colours from {first:.6g} to {last:.6g}; {view}")
 
 
 def recover(arguments: Any) -> None:
@@ -159,6 +167,49 @@ def _mesh(arguments: Any) -> TetMesh:
     return read_mesh(arguments.file, field=arguments.field, step=step, block=arguments.block)
 
 
+def _camera(mesh: TetMesh, transfer: TransferFunction, arguments: Any) -> tuple[Camera, str]:
+    """The view that is asked for, and what was chosen."""
+    a = arguments
+    size = {"fov": a.fov, "width": a.width, "height": a.height}
+    angles = {"azimuth": a.azimuth, "elevation": a.elevation, "zoom": a.zoom}
+    given = {name: x for name, x in angles.items() if x is not None}
+    if a.eye is None:
+        name = best_up(mesh, transfer, fov=a.fov, **given) if a.up is None else None
+        up = UPS[name] if name else a.up
+        camera = Camera.orbit(mesh, up=up, **given, **size)
+        return camera, f"{name} up, which shows most (--up)" if name else f"up {_numbers(up)}"
+    if given:
+        raise ValueError(f"--eye says where from: leave out {', '.join('--' + x for x in given)}.")
+    low, high = (np.asarray(x, np.float64) for x in mesh.bounds())
+    up = a.up or UPS["z" if abs(_along(low, high, a.eye)[1]) > 0.99 else "y"]
+    camera = Camera.look_at(a.eye, (low + high) / 2, up, **size, dtype=mesh.dtype)
+    return camera, f"up {_numbers(up)}"
+
+
+def _along(low: np.ndarray, high: np.ndarray, eye: Any) -> np.ndarray:
+    """The direction from an eye to the middle of a box."""
+    ahead = (low + high) / 2 - np.asarray(eye)
+    return ahead / max(float(np.abs(ahead).max()), np.finfo(float).tiny)
+
+
+def _numbers(x: Any) -> str:
+    return "(" + ", ".join(f"{v:g}" for v in x) + ")"
+
+
+def _up(text: str) -> tuple[float, ...]:
+    """An axis such as z or -y, or three numbers with commas."""
+    sign, name = (-1.0, text[1:]) if text.startswith("-") else (1.0, text)
+    if name in UPS:
+        return tuple(sign * x + 0.0 for x in UPS[name])
+    parts = tuple(float(x) for x in text.split(","))
+    if len(parts) != 3 or not any(parts):
+        raise ValueError
+    return parts
+
+
+_up.__name__ = "axis"  # argparse names it where it fails
+
+
 def _is_plot3d(arguments: Any) -> bool:
     return arguments.q is not None or Path(arguments.file).suffix.lower() in _PLOT3D
 
@@ -185,6 +236,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="jaxvr", description="Differentiable volume rendering of unstructured meshes."
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="of jaxvr, JAX and Python")
     shown = " (%(default)s)"
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
 
@@ -227,15 +279,33 @@ def _parser() -> argparse.ArgumentParser:
         "with extinction rising from 0" + shown,
     )
     optics(made)
-    for name, default, about in (
-        ("azimuth", 30.0, "degrees round the vertical axis"),
-        ("elevation", 20.0, "degrees above the horizon"),
-        ("zoom", 1.0, "magnification; at 1 the bounding ball fits"),
-        ("fov", 30.0, "vertical field of view in degrees"),
+    made.add_argument(
+        "--up",
+        type=_up,
+        metavar="AXIS",
+        help="x, y, z, --up=-z or three numbers x,y,z (that of y, z, x which shows most)",
+    )
+    for name, about in (
+        ("azimuth", "degrees round the axis that is up (30)"),
+        ("elevation", "degrees above the horizon (20)"),
+        ("zoom", "magnification; at 1, which is the default, the bounding ball fits"),
     ):
-        made.add_argument(f"--{name}", type=float, default=default, metavar="X", help=about + shown)
+        made.add_argument(f"--{name}", type=float, metavar="X", help=about)
+    made.add_argument(
+        *("--eye",),
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="where to look from, at the middle of the box, instead of these angles",
+    )
+    made.add_argument(
+        "--fov", type=float, default=30.0, metavar="X", help="vertical view angle, degrees" + shown
+    )
     for name in ("width", "height"):
         made.add_argument(f"--{name}", type=int, default=512, metavar="N", help="pixels" + shown)
+    made.add_argument(
+        "--scalar-bar", action="store_true", help="draw the transfer function beside a .png"
+    )
     made.add_argument(
         *("-o", "--output"),
         required=True,
@@ -264,6 +334,20 @@ def _parser() -> argparse.ArgumentParser:
     made.add_argument("--quiet", action="store_true", help="no progress bar")
     made.add_argument("-o", "--output", required=True, metavar="FOLDER", help="pictures, report")
     return parser
+
+
+class _Version(argparse.Action):
+    """Tells what somebody who reports a fault is asked for."""
+
+    def __call__(self, parser: Any, *_: Any, **__: Any) -> None:
+        import platform
+
+        import jax
+
+        from jaxvr import __version__
+
+        print(f"jaxvr {__version__} (jax {jax.__version__}, Python {platform.python_version()})")
+        parser.exit()
 
 
 class _Parser(argparse.ArgumentParser):

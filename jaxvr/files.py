@@ -42,7 +42,7 @@ def save_image(
         alpha, as the format wants it. Bytes (uint8), as `turntable` returns them, are written as
         they are.
     .npy: the array as it is, for `numpy.load`.
-    .exr: float32, premultiplied and linear, as OpenEXR wants it. Needs `pip install 'jaxvr[exr]'`.
+    .exr: float32, premultiplied and linear, as OpenEXR wants it. Needs `pip install OpenEXR`.
 
     Args:
       background: linear RGB (3,) to put behind the image, which is opaque then.
@@ -73,7 +73,7 @@ def save_animation(path: str | os.PathLike[str], frames: Any, fps: float = 24) -
         of two of them, in a pattern that stays where it is, so that nothing flickers. At most 50
         frames a second; equal neighbours may become one frame that is shown for longer.
     .mp4: H.264, which browsers and slides play. Needs the program ffmpeg on the PATH, or
-        `pip install 'jaxvr[mp4]'`. An odd width or height gets its last column or row twice.
+        `pip install imageio-ffmpeg`. An odd width or height gets its last column or row twice.
     .png: a file for each frame: name.png becomes name_000.png, name_001.png, ...
 
     Args:
@@ -261,7 +261,7 @@ def _openexr() -> Any:
         module = None
     if not hasattr(module, "File"):  # before version 3.3
         raise ValueError(
-            ".exr files need the package OpenEXR, 3.3 or newer: pip install 'jaxvr[exr]'. "
+            ".exr files need the package OpenEXR, 3.3 or newer: pip install 'OpenEXR>=3.3'. "
             ".npy files hold the same floats without it."
         )
     return module
@@ -411,7 +411,7 @@ def _ffmpeg() -> str:
         return importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
     except (ImportError, RuntimeError):
         raise ValueError(
-            ".mp4 files need ffmpeg: install the program, or pip install 'jaxvr[mp4]'. "
+            ".mp4 files need ffmpeg: install the program, or pip install imageio-ffmpeg. "
             ".gif files need neither."
         ) from None
 

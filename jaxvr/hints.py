@@ -24,6 +24,7 @@ from ._core.units import near_one, norm
 from .optics import TransferFunction
 from .view.camera import Camera
 from .volume.mesh import TetMesh
+from .volume.statistics import used_points, value_range, weighted_values
 
 Array = jax.Array
 
@@ -73,6 +74,8 @@ def look(
     dense = top <= 1 and top * diagonal > max(DENSE, DENSE_CELL * volume.n_tets ** (1 / 3))
     if not (alpha < FAINT or odd or dense or cut):
         return
+    low, high = value_range(volume)
+    odd = odd and _odd((low, high), (first, last))
     if not np.asarray(transfer.extinctions).any():
         return  # nothing is to be seen, and nothing is
     if alpha < FAINT:
@@ -120,7 +123,7 @@ def _unfit(volume: TetMesh, transfer: TransferFunction) -> str | None:
     stands for what they can hold."""
     ramp = np.linspace(1, 2, len(transfer.positions))
     ramp = TransferFunction(transfer.positions, np.stack([ramp - 1] * 3, axis=1), ramp)
-    field = float(volume.values.min()), float(volume.values.max())
+    field = value_range(volume)
     return _ranges(volume, ramp, field) if _odd(field, _ends(ramp)) else None
 
 
@@ -264,14 +267,14 @@ def _ranges(volume: TetMesh, transfer: TransferFunction, field: tuple[float, flo
         part = 100 * (high - low) / (last - first)
         return f"{ranges}, of which the field takes {part:.2g} %: it is of one colour. {advice}"
     if 0 < last - first < NARROW * (high - low):
-        values = np.asarray(volume.values)
-        between = float(((values > first) & (values < last)).mean())
-        beyond = float((values < first).mean()), float((values > last).mean())
+        values, weights = weighted_values(volume)
+        between = float(weights[(values > first) & (values < last)].sum())
+        beyond = float(weights[values < first].sum()), float(weights[values > last].sum())
         # Clear where values lie beyond it, it is a threshold or a peak, narrow on purpose.
         clear = any(beyond[k] > NARROW and numbers[-k, 3] == 0 for k in (0, 1))
         if between < NARROW and not clear:
             return (
-                f"{ranges}, where {100 * between:.2g} % of the values are: the others have the "
+                f"{ranges}, where {100 * between:.2g} % of the volume is: the rest has the "
                 f"colours of its two ends. {advice}"
             )
     return None
@@ -318,9 +321,7 @@ def _inside(volume: TetMesh, camera: Camera) -> str | None:
 
 def _used(volume: TetMesh) -> np.ndarray:
     """The points (P, 3) that cells use, float64."""
-    used = np.zeros(volume.n_points, bool)
-    used[np.asarray(volume.cells)] = True
-    return np.asarray(volume.points, np.float64)[used]
+    return np.asarray(volume.points, np.float64)[used_points(volume)]
 
 
 def _numbers(transfer: TransferFunction) -> np.ndarray:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from functools import partial
-from typing import Any
+from typing import Any, Literal, overload
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,7 @@ from jaxvr.units import mesh_in, transfer_in, units_of
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
 from jaxvr.volume.integrity import hold, unasked
+from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
 
@@ -63,8 +64,41 @@ NUMBERS_PER_RAY = 212
 _PARTS = 20
 
 
+@overload
 def render(
-    volume: Any,
+    volume: TetMesh,
+    camera: Camera,
+    transfer: TransferFunction,
+    *,
+    tracer: AbstractTracer | None = None,
+    integrator: AbstractIntegrator | None = None,
+    compositor: Over | None = None,
+    adjoint: AbstractAdjoint | None = None,
+    background: Any = None,
+    budget: int | None = None,
+    status: Literal[False] = False,
+) -> Array: ...
+
+
+@overload
+def render(
+    volume: TetMesh,
+    camera: Camera,
+    transfer: TransferFunction,
+    *,
+    tracer: AbstractTracer | None = None,
+    integrator: AbstractIntegrator | None = None,
+    compositor: Over | None = None,
+    adjoint: AbstractAdjoint | None = None,
+    background: Any = None,
+    budget: int | None = None,
+    status: Literal[True],
+) -> tuple[Array, Array]: ...
+
+
+@overload
+def render(
+    volume: TetMesh,
     camera: Camera,
     transfer: TransferFunction,
     *,
@@ -75,7 +109,22 @@ def render(
     background: Any = None,
     budget: int | None = None,
     status: bool = False,
-) -> Any:
+) -> Array | tuple[Array, Array]: ...
+
+
+def render(
+    volume: TetMesh,
+    camera: Camera,
+    transfer: TransferFunction,
+    *,
+    tracer: AbstractTracer | None = None,
+    integrator: AbstractIntegrator | None = None,
+    compositor: Over | None = None,
+    adjoint: AbstractAdjoint | None = None,
+    background: Any = None,
+    budget: int | None = None,
+    status: bool = False,
+) -> Array | tuple[Array, Array]:
     """An image of a volume.
 
     Args:
@@ -123,8 +172,43 @@ def render(
     return unasked(volume, image, bits)
 
 
+@overload
 def render_rays(
-    volume: Any,
+    volume: TetMesh,
+    origins: Any,
+    directions: Any,
+    transfer: TransferFunction,
+    *,
+    tracer: AbstractTracer | None = None,
+    integrator: AbstractIntegrator | None = None,
+    compositor: Over | None = None,
+    adjoint: AbstractAdjoint | None = None,
+    background: Any = None,
+    budget: int | None = None,
+    status: Literal[False] = False,
+) -> Array: ...
+
+
+@overload
+def render_rays(
+    volume: TetMesh,
+    origins: Any,
+    directions: Any,
+    transfer: TransferFunction,
+    *,
+    tracer: AbstractTracer | None = None,
+    integrator: AbstractIntegrator | None = None,
+    compositor: Over | None = None,
+    adjoint: AbstractAdjoint | None = None,
+    background: Any = None,
+    budget: int | None = None,
+    status: Literal[True],
+) -> tuple[Array, Array]: ...
+
+
+@overload
+def render_rays(
+    volume: TetMesh,
     origins: Any,
     directions: Any,
     transfer: TransferFunction,
@@ -136,7 +220,23 @@ def render_rays(
     background: Any = None,
     budget: int | None = None,
     status: bool = False,
-) -> Any:
+) -> Array | tuple[Array, Array]: ...
+
+
+def render_rays(
+    volume: TetMesh,
+    origins: Any,
+    directions: Any,
+    transfer: TransferFunction,
+    *,
+    tracer: AbstractTracer | None = None,
+    integrator: AbstractIntegrator | None = None,
+    compositor: Over | None = None,
+    adjoint: AbstractAdjoint | None = None,
+    background: Any = None,
+    budget: int | None = None,
+    status: bool = False,
+) -> Array | tuple[Array, Array]:
     """The colours that rays see.
 
     Args:
@@ -167,7 +267,7 @@ def render_rays(
 
 
 def trace(
-    volume: Any,
+    volume: TetMesh,
     camera: Camera | tuple[Any, Any],
     *,
     tracer: AbstractTracer | None = None,

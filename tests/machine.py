@@ -258,7 +258,7 @@ def bad_calls(scene: Scene) -> list[Any]:
 
     return [
         lambda: mesh.replace(values=nan),
-        lambda: jaxvr.render(mesh, camera, None),  # pyright: ignore[reportArgumentType]
+        lambda: jaxvr.render(mesh, camera, None),  # pyright: ignore
         lambda: jaxvr.render(mesh, camera, transfer, budget=0),
         lambda: transfer.replace(positions=np.asarray(transfer.positions)[::-1]),
         lambda: jaxvr.render(mesh, camera, transfer, background=(1, 2)),

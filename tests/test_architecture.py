@@ -13,7 +13,7 @@ ROOT = Path(jaxvr.__file__).parent
 ROOMS = [
     "_core", "numerics", "volume", "view", "optics", "order", "trace", "composite", "native",
     "adjoint", "arguments", "units", "defaults", "hints", "render", "probe", "fit", "shard",
-    "files", "testing", "plot", "pictures", "interact", "cli", "__main__",
+    "files", "testing", "plot", "pictures", "interact", "accessors", "cli", "__main__",
 ]  # fmt: skip
 FILES = sorted(p.relative_to(ROOT) for p in ROOT.rglob("*.py") if p.name != "__init__.py")
 

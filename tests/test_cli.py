@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ import pytest
 
 import jaxvr
 from jaxvr.cli import main
+from jaxvr.defaults import UPS, best_up
 from tests.stand_ins import flow_fields, named, ring
 
 pytestmark = pytest.mark.usefixtures("quick_code")
@@ -60,13 +62,43 @@ def test_render_png_is_transparent_and_npy_is_exact(mesh, tf, tmp_path, capsys):
         assert main(["render", mesh, "--tf", tf, "-o", str(tmp_path / name), *SMALL]) == 0
     image = np.load(tmp_path / "a.npy")
     volume = jaxvr.read_mesh(mesh)
-    camera = jaxvr.Camera.orbit(volume, width=12, height=12)
+    up = UPS[best_up(volume, jaxvr.TransferFunction.from_json(tf))]
+    camera = jaxvr.Camera.orbit(volume, up=up, width=12, height=12)
     want = jaxvr.render(volume, camera, jaxvr.TransferFunction.from_json(tf))
     np.testing.assert_allclose(image, want, atol=1e-6)
     png = matplotlib.image.imread(tmp_path / "a.png")
     assert png.shape == (12, 12, 4) and png[0, 0, 3] == 0
     np.testing.assert_allclose(png[..., 3], image[..., 3], atol=0.51 / 255)
     assert "a.png" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "said", "camera"),
+    [
+        (["--up", "z"], "up (0, 0, 1)", {"up": (0, 0, 1)}),
+        (["--up=-y", "--azimuth", "70"], "up (0, -1, 0)", {"up": (0, -1, 0), "azimuth": 70}),
+        (["--up", "0,1,1", "--zoom", "2"], "up (0, 1, 1)", {"up": (0, 1, 1), "zoom": 2}),
+        (["--eye", "3", "2", "4"], "up (0, 1, 0)", {"eye": (3, 2, 4)}),
+        (["--eye", "0.5", "9", "0.5"], "up (0, 0, 1)", {"eye": (0.5, 9, 0.5), "up": (0, 0, 1)}),
+    ],
+)
+def test_where_it_is_seen_from(given, said, camera, mesh, tmp_path, capsys):
+    assert main(["render", mesh, "-o", str(tmp_path / "a.npy"), *SMALL, *given]) == 0
+    out = capsys.readouterr().out
+    assert said in out and "field values, " in out and "colours from" in out
+    volume = jaxvr.read_mesh(mesh)
+    make = jaxvr.Camera.look_at if "eye" in camera else jaxvr.Camera.orbit
+    first = {"target": (0.5, 0.5, 0.5)} if "eye" in camera else {"volume": volume}
+    view = make(**first, **camera, width=12, height=12)
+    want = jaxvr.render(volume, view, jaxvr.default_transfer(volume))
+    np.testing.assert_allclose(np.load(tmp_path / "a.npy"), want, atol=1e-5)
+
+
+def test_the_chosen_axis_is_told_and_a_scalar_bar_is_drawn(mesh, tmp_path, capsys):
+    out = str(tmp_path / "bar.png")
+    assert main(["render", mesh, "-o", out, *SMALL, "--scalar-bar"]) == 0
+    assert " up, which shows most (--up)" in capsys.readouterr().out
+    assert min(matplotlib.image.imread(out).shape[:2]) > 100  # a figure round the 12 pixels
 
 
 def test_render_colormap_on_a_background(mesh, tmp_path):
@@ -102,6 +134,10 @@ def test_fit(mesh, tf, tmp_path, capsys):
         (["render", "MESH", "-o", "OUT/a.png", "--width", "0"], "width"),
         (["render", "MESH", "-o", "OUT/a.png", "--opacity", "-1"], "not be negative"),
         (["render", "MESH", "-o", "OUT/a.png", "--width", "x"], "invalid int value"),
+        (["render", "MESH", "-o", "OUT/a.npy", "--scalar-bar"], "drawn on a .png"),
+        (["render", "MESH", "-o", "OUT/a.png", "--up", "w"], "invalid axis value"),
+        (["render", "MESH", "-o", "OUT/a.png", "--up", "0,0,0"], "invalid axis value"),
+        (["render", "MESH", "-o", "OUT/a.png", "--eye", "1", "2", "3", "--zoom", "2"], "--zoom"),
         (["render", "MESH"], "required"),
         (["render", "nowhere.vtu", "-o", "OUT/a.png"], "nowhere.vtu"),
         (["info", "OUT"], "folder"),
@@ -139,15 +175,25 @@ def test_help(command, capsys):
 
 
 def test_python_m_jaxvr_as_users_run_it(mesh, tmp_path):
-    """In a process of its own, without x64: no warning either."""
+    """In a process of its own, without x64: no warning either. Nor from what the first has compiled
+    for the second, in a folder that nobody else can write to."""
     out = tmp_path / "a.npy"
+    names = {"JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"}  # those of `conftest`
+    environment = {name: x for name, x in os.environ.items() if name not in names}
+    environment["JAXVR_CACHE"] = str(tmp_path / "cache")
 
     def run(*arguments):
         command = [sys.executable, "-m", "jaxvr", *arguments]
-        return subprocess.run(command, capture_output=True, text=True)
+        return subprocess.run(command, capture_output=True, text=True, env=environment)
 
-    done = run("render", mesh, "-o", str(out), *SMALL)
-    assert (done.returncode, done.stderr) == (0, "") and np.load(out).dtype == np.float32
+    kept = []
+    for _ in range(2):
+        done = run("render", mesh, "-o", str(out), *SMALL)
+        assert (done.returncode, done.stderr) == (0, "") and np.load(out).dtype == np.float32
+        folder = tmp_path / "cache" / "xla"
+        assert folder.stat().st_mode & 0o077 == 0
+        kept.append({file.name for file in folder.iterdir() if not file.name.endswith("atime")})
+    assert kept[0] and kept[0] <= kept[1]  # what compiles quickly is kept or not, as it happens
     done = run("info", "nowhere.vtu")
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.strip().splitlines() == ["jaxvr: error: There is no file 'nowhere.vtu'."]

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 import jaxvr
+import jaxvr.accessors  # which PyVista finds by itself where jaxvr is installed: see test_package
 import jaxvr.plot
 from jaxvr import cli
 from jaxvr.adjoint.base import AbstractAdjoint
@@ -29,7 +30,7 @@ from notebooks.site import collect, listed, public
 
 ROOT = Path(__file__).resolve().parents[1]
 OTHERS = sorted([*ROOT.glob("notebooks/*.md"), *ROOT.glob("experiments/*.md")])
-PAGES = [ROOT / "README.md", *OTHERS]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *OTHERS]
 NOTEBOOKS = sorted(ROOT.glob("notebooks/*.ipynb"))
 GUIDES = [p for p in PAGES if p.parent.name != "experiments"]
 

@@ -97,9 +97,9 @@ def test_what_is_missing_is_named(tmp_path, monkeypatch):
 
     monkeypatch.setattr(importlib, "import_module", nowhere)
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.raises(ValueError, match=r"pip install 'jaxvr\[exr\]'"):
+    with pytest.raises(ValueError, match=r"pip install 'OpenEXR>=3.3'"):
         save_image(tmp_path / "a.exr", picture())
-    with pytest.raises(ValueError, match=r"install the program, or pip install 'jaxvr\[mp4\]'"):
+    with pytest.raises(ValueError, match=r"install the program, or pip install imageio-ffmpeg"):
         save_animation(tmp_path / "a.mp4", [picture()])
 
 

@@ -132,14 +132,14 @@ def test_values_in_other_units(mesh, camera):
     kilopascal, pascal = mesh.replace(values=101 * mesh.values), ramp(0, 101e3)
     assert "field takes 0.1 %: it is of one colour" in told(kilopascal, camera, pascal)
     other_way = mesh.replace(values=101e3 * mesh.values - 1)
-    assert "0 % of the values are" in told(other_way, camera, ramp(0, 101))
+    assert "0 % of the volume is" in told(other_way, camera, ramp(0, 101))
     jaxvr.render(kilopascal, camera, ramp(0, 101))
     for factor in (50, 100):  # percent against parts of one
         assert "it is of one colour" in told(mesh, camera, ramp(0, factor))
         percent = mesh.replace(values=factor * mesh.values)
         fading = jaxvr.TransferFunction.from_colormap("viridis", [0.0, 1.0], [0.0, 2.0])
         for transfer in (ramp(), fading):
-            assert "0 % of the values are" in told(percent, camera, transfer)
+            assert "0 % of the volume is" in told(percent, camera, transfer)
     # Control points far away, or close together, are no mistake where others are at work.
     far = ramp().resample([-1e9, 0.0, 0.3, 1.0, 1e9])
     jaxvr.render(mesh, camera, far)

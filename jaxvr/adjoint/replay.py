@@ -18,8 +18,9 @@ keeps what the trace made last had. So these may depend on nothing but the struc
 arguments: a flag there would be read by pullbacks of other patterns, whose gradients then are 0
 without a word. Flags travel as shapes of empty arrays, which belong to the trace itself.
 
-Path replay is due to Vicini, Speierer and Jakob 2021; unlike theirs and DiffDVR's (Weiss and
-Westermann 2021) it divides by no transmittance: an opaque cell is no singularity.
+Path replay is due to Vicini, Speierer and Jakob 2021 (doi:10.1145/3450626.3459804); unlike theirs
+and DiffDVR's (Weiss and Westermann 2021, doi:10.1109/TVCG.2021.3114769) it divides by no
+transmittance: an opaque cell is no singularity.
 """
 
 from __future__ import annotations

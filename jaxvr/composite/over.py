@@ -12,8 +12,8 @@ The second is the light from behind piece i: final minus prefix, with the arithm
 forward pass, so that the difference cancels to zero where nothing is behind.
 
 What is behind piece i is seen through T_{i+1} = exp(-sum_{j <= i} S_j), so a ray may end there once
-that is small (early ray termination, Levoy 1990). With colours of at most C in size, the sums are
-then short of
+that is small (early ray termination, Levoy 1990, doi:10.1145/78964.78965). With colours of at most
+C in size, the sums are then short of
 
     |sum_{j > i} T_j c_j| <= C (T_{i+1} - T_end) <= C T_{i+1}        0 <= T_{i+1} - T_end <= T_{i+1}
 

@@ -12,12 +12,11 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from jaxvr import hints
 from jaxvr._core.checks import require_kind
@@ -45,6 +44,9 @@ from jaxvr.fit.targets import look_at_targets, pictures_of
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.render import render_rays, shade
 from jaxvr.trace import AbstractTracer, Recorded, Segments
+
+if TYPE_CHECKING:  # it takes a while to import
+    import optax
 
 Array = jax.Array
 

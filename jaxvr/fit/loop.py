@@ -11,17 +11,19 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from tqdm import tqdm
 
 from jaxvr._core.status import check
 from jaxvr.fit import digest, resume
 from jaxvr.fit.differences import environment
+
+if TYPE_CHECKING:  # it takes a while to import
+    import optax
 
 
 class FitError(RuntimeError):
@@ -261,6 +263,8 @@ def is_stale(losses: list[float], epoch: int, patience: int | None, tolerance: f
 
 @functools.lru_cache(maxsize=8)
 def _adam(learning_rate: Any) -> optax.GradientTransformation:
+    import optax
+
     return optax.adam(learning_rate)
 
 
@@ -277,6 +281,8 @@ def adam(learning_rate: Any) -> optax.GradientTransformation:
 
 @functools.lru_cache(maxsize=8)
 def _update_of(optimizer: Any) -> Callable[..., Any]:
+    import optax
+
     @jax.jit
     def update(parameters, state, gradient):
         finite = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(gradient)]).all()

@@ -55,7 +55,7 @@ def explore(
         if error.name not in ("anywidget", "ipywidgets", "traitlets"):
             raise
         raise ImportError(
-            f"explore needs {error.name}, which is not installed: pip install 'jaxvr[notebooks]'"
+            f"explore needs {error.name}, which is not installed: pip install anywidget jupyterlab"
         ) from error
     viewer = Viewer(
         volume,

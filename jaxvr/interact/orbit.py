@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxvr._core.units import norm
-from jaxvr.view.camera import Camera
+from jaxvr.view.camera import Camera, orbit_axes
 
 # Straight up or down a picture has no upper side.
 STEEPEST = 89.0
@@ -41,7 +41,7 @@ class Orbit:
         eye, target, up = (
             np.asarray(v, np.float64) for v in (camera.eye, camera.target, camera.up)
         )
-        axes = _axes(up)
+        axes = orbit_axes(up)
         out = eye - target
         distance = norm(out)
         x, y, z = axes @ (out / distance)
@@ -106,16 +106,6 @@ class Orbit:
         out = math.cos(e) * (math.sin(a) * x + math.cos(a) * z) + math.sin(e) * y
         side = math.cos(a) * x - math.sin(a) * z
         return side, np.cross(out, side), out
-
-
-def _axes(up: np.ndarray) -> np.ndarray:
-    """A right-handed frame (3, 3) whose second row is up: the world's own where up is y."""
-    y = up / norm(up)
-    world = np.eye(3)[[2, 0, 1]]
-    z = world[np.argmin(np.abs(world @ y))]
-    z = z - (z @ y) * y
-    z /= np.linalg.norm(z)
-    return np.stack([np.cross(y, z), y, z])
 
 
 def _between(x: float, low: float, high: float) -> float:

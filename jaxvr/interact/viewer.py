@@ -19,7 +19,7 @@ from jaxvr._core.brief import is_known
 from jaxvr._core.checks import require_kind
 from jaxvr._core.status import check
 from jaxvr.arguments import background_of
-from jaxvr.defaults import default_transfer, diagonal
+from jaxvr.defaults import UPS, best_up, default_transfer, diagonal
 from jaxvr.interact import edits as _edits
 from jaxvr.interact.orbit import Orbit
 from jaxvr.interact.pace import Pace
@@ -29,6 +29,7 @@ from jaxvr.render import render, shade, trace
 from jaxvr.trace import AbstractTracer, Segments
 from jaxvr.view.camera import Camera
 from jaxvr.volume.mesh import TetMesh
+from jaxvr.volume.statistics import used_values, value_range
 
 # More segments than this are not kept: views are rendered then.
 SEGMENT_BYTES = 1 << 30
@@ -70,14 +71,15 @@ class Viewer:
             raise ValueError(f"coarse must be pixels of a side, at least 1, but is {coarse!r}.")
         self.volume, self.tracer, self.integrator = volume, tracer, integrator
         self.background = background_of(background)
-        values = np.asarray(volume.values)
-        self.range = float(values.min()), float(values.max())
-        camera = camera or Camera.orbit(volume, width=size, height=size)
-        self.orbit = self._first_orbit = Orbit.of(camera, diagonal(volume) / 2)
-        self.width, self.height = camera.width, camera.height
+        self.range = value_range(volume)
         self._transfer = self._first_transfer = _transfer_of(
             transfer or default_transfer(volume, points=POINTS)
         )
+        if camera is None:
+            up = UPS[best_up(volume, self._transfer)]
+            camera = Camera.orbit(volume, up=up, width=size, height=size)
+        self.orbit = self._first_orbit = Orbit.of(camera, diagonal(volume) / 2)
+        self.width, self.height = camera.width, camera.height
         # Shading is faster than rendering, so it may have more pixels.
         self._paces = {
             "render": Pace(self.width, self.height, coarse),
@@ -209,7 +211,7 @@ class Viewer:
 
     def setup(self) -> dict[str, Any]:
         """What does not change, as a message: size, range of the field, its histogram."""
-        counts, _ = svg.histogram(self.volume.values, *self.range)
+        counts, _ = svg.histogram(used_values(self.volume), *self.range)
         return {
             "width": self.width,
             "height": self.height,

@@ -6,7 +6,7 @@ that holds everything it depends on, and a digest of itself (see `cache`).
 
     JAXVR_NATIVE=0    use JAX's own loops only; asked at every call
     JAXVR_CC          the C compiler, with options; else cc, gcc or clang, else that of `ziglang`
-                      (the extra `native`: pip install 'jaxvr[native]')
+                      (pip install ziglang; the extra `native`)
     JAXVR_CACHE       the folder for compiled libraries; else jaxvr in the user's cache folder
 
 Nothing that goes wrong here is an exception of `render`: there is a reason, one warning for it, and
@@ -144,7 +144,7 @@ def _build(dtype: str) -> Path:
     command = compiler()
     if command is None:
         raise NativeError(
-            "There is no C compiler: install one, or `pip install 'jaxvr[native]'` for ziglang's."
+            "There is no C compiler: install one, or `pip install ziglang`, which brings one."
         )
     flags = [*FLAGS, *machine_flags(), *(["-DJAXVR_DOUBLE"] if dtype == "float64" else [])]
     headers = Path(jax.ffi.include_dir())

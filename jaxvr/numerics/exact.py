@@ -10,7 +10,8 @@ of the ray it passes. Here they agree to the bit, because the answer is exact:
 - `edge_side` is the sign of x_i y_j - x_j y_i. Two correctly rounded products that differ compare
   like the exact ones; if they are equal, their exact rounding errors decide (Dekker 1971); and if
   those are equal too, the origin lies on the edge's line and a consistent infinitesimal shift
-  decides (simulation of simplicity, Edelsbrunner and Muecke 1990).
+  decides (simulation of simplicity, Edelsbrunner and Muecke 1990,
+  doi:10.1145/77635.77639).
 """
 
 from __future__ import annotations

@@ -29,7 +29,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from jaxvr.numerics.moments import opacity, transmittance, weights_tangent
 from jaxvr.numerics.rules import DOUBLE
@@ -72,6 +71,8 @@ def moment_splines(size: int) -> np.ndarray:
 
 def _coefficients(values: np.ndarray) -> np.ndarray:
     """(N, M) -> (N + 2, M): of the cubic spline through columns, on *uniform* B-splines."""
+    from scipy.interpolate import make_interp_spline  # here, since it takes a while to import
+
     size = len(values)
     spline = make_interp_spline(np.arange(size), values, k=3)  # not-a-knot at both ends
     # The blossom of a cubic at three consecutive knots is its coefficient; the pieces next to the

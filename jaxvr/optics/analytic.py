@@ -1,8 +1,9 @@
 """The exact integrator.
 
 For linear extinction and linear colour the emission-absorption integral of a slab is known
-(Williams, Max and Stein 1998; Moreland and Angel 2004). It is evaluated here to rounding in both
-precisions, over the whole domain: see `jaxvr.numerics.moments`.
+(Williams, Max and Stein 1998, doi:10.1109/2945.675650; Moreland and Angel 2004,
+doi:10.1109/SVVG.2004.2). It is evaluated here to rounding in both precisions, over the whole
+domain: see `jaxvr.numerics.moments`.
 """
 
 from __future__ import annotations

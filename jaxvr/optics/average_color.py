@@ -14,10 +14,10 @@ class AverageColor(AbstractEndIntegrator):
 
         rgb = (C_front + C_back) / 2 * alpha,    alpha = 1 - exp(-(a + b) / 2)
 
-    Shirley and Tuchman 1990 colour the thick vertex of a projected tetrahedron like this; Stein,
-    Becker and Max 1994 take the exponential at every pixel. Here to compare with: an opaque segment
-    shows half of the colour that it hides, and peaks of the transfer function that lie between the
-    two ends are missed.
+    Shirley and Tuchman 1990 (doi:10.1145/99308.99322) colour the thick vertex of a projected
+    tetrahedron like this; Stein, Becker and Max 1994 (doi:10.1145/197938.197971) take the
+    exponential at every pixel. Here to compare with: an opaque segment shows half of the colour
+    that it hides, and peaks of the transfer function that lie between the two ends are missed.
     """
 
     def weights(self, a, b):

@@ -33,9 +33,10 @@ def _back_weight(depth: Array) -> Array:
 class ConstantExtinction(AbstractEndIntegrator):
     """Extinction constant along a segment, at the mean of its two ends, and colour linear.
 
-    The extinction is that of Stein, Becker and Max 1994; the colour's integral is exact for it.
-    Here to compare with: where extinction rises towards the back, too much of the front is shown,
-    and the other way round; peaks of the transfer function between the two ends are missed.
+    The extinction is that of Stein, Becker and Max 1994 (doi:10.1145/197938.197971); the colour's
+    integral is exact for it. Here to compare with: where extinction rises towards the back, too
+    much of the front is shown, and the other way round; peaks of the transfer function between the
+    two ends are missed.
     """
 
     def weights(self, a, b):

@@ -1,5 +1,7 @@
 """Partial pre-integration (Moreland and Angel 2004; Espinha and Celes 2005).
 
+doi:10.1109/SVVG.2004.2, doi:10.1109/SIBGRAPI.2005.29
+
 A slab's integral needs one function of two numbers, psi(a, b), which does not depend on the
 transfer function and so is tabulated once for all. What tables there are, and how exact: see
 `jaxvr.numerics.tables`.

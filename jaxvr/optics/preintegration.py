@@ -4,6 +4,9 @@ Roettger, Kraus and Ertl 2000; Engel, Kraus and Ertl 2001; here as in Callahan e
 lengths) and in Kraus, Qiao and Ebert 2004 (logarithmic lengths). The table's length runs from 0 to
 the longest segment there can be, its scalars from the first control point to the last; what lies
 outside of them has constant colour and extinction, and its part of a segment is integrated exactly.
+
+doi:10.1109/VISUAL.2000.885683, doi:10.1145/383507.383515, doi:10.1109/TVCG.2005.46,
+doi:10.1109/VISUAL.2004.85
 """
 
 from __future__ import annotations

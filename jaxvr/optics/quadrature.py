@@ -33,7 +33,8 @@ def _sample(a, b, nodes, weights):
 
 
 def _riemann(a, b, samples):
-    # Equal pieces, each with the extinction and colour of its middle (Max 1995).
+    # Equal pieces, each with the extinction and colour of its middle (Max 1995,
+    # doi:10.1109/2945.468400).
     number, total, back = a.dtype.type, 0.0, 0.0
     step, through = number(1 / samples), jnp.ones_like(a)
     for k in range(samples):

@@ -61,7 +61,7 @@ def write(tf: TransferFunction, unit_distance: float = 1.0) -> tuple[Any, Any]:
         from vtkmodules.vtkCommonDataModel import vtkPiecewiseFunction
         from vtkmodules.vtkRenderingCore import vtkColorTransferFunction
     except ImportError as e:
-        raise ImportError("to_vtk needs VTK: pip install 'jaxvr[peers]'") from e
+        raise ImportError("to_vtk needs VTK: pip install vtk") from e
     x, colors, extinctions = (
         np.asarray(a, np.float64) for a in (tf.positions, tf.colors, tf.extinctions)
     )

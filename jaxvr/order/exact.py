@@ -2,9 +2,10 @@
 
 Two cells that share a face are in order: the one on the eye's side of the face comes first. Cells
 sorted topologically by these relations are in visibility order if the mesh is convex and has no
-cycles (MPVO: Williams, "Visibility ordering meshed polyhedra", 1992). Where a mesh is not convex, a
-ray leaves it and enters it again, and then the cell of the exit comes before that of the entry
-(SXMPVO: Cook, Max, Silva and Williams 2004; see `order.gaps`).
+cycles (MPVO: Williams, "Visibility ordering meshed polyhedra", 1992, doi:10.1145/130826.130899).
+Where a mesh is not convex, a ray leaves it and enters it again, and then the cell of the exit comes
+before that of the entry (SXMPVO: Cook, Max, Silva and Williams 2004, doi:10.1109/TVCG.2004.45; see
+`order.gaps`).
 
 Here
 
@@ -28,8 +29,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from jaxvr._core.checks import is_concrete
 from jaxvr.order.gaps import View, across_gaps, expand, look
@@ -169,6 +168,8 @@ def _sort(
 
 def _levels(rank: np.ndarray, before: np.ndarray, after: np.ndarray) -> int:
     """Ranks cells that have none, level by level, as far as there are no cycles."""
+    from scipy.sparse import coo_matrix  # here, since it takes a while to import
+
     n = len(rank)
     graph = coo_matrix((np.ones(len(before), np.int8), (before, after)), shape=(n, n)).tocsr()
     waits = np.bincount(graph.indices, minlength=n)
@@ -187,6 +188,9 @@ def _levels(rank: np.ndarray, before: np.ndarray, after: np.ndarray) -> int:
 
 def _without_cycles(distance: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Which relations (E,) to keep so that no cycle is left; see the module."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     keep = np.ones(len(before), bool)
     live = np.arange(len(before))
     for _ in range(_PASSES):

@@ -12,6 +12,7 @@ from jaxvr._core.checks import as_floats, require_finite, require_shape
 from jaxvr.optics.transfer import TransferFunction
 from jaxvr.plot.axes import color_as, ink, legend_of, new_axes, set_title
 from jaxvr.volume.mesh import TetMesh
+from jaxvr.volume.statistics import used_values
 
 # More control points than this are not marked one by one.
 MARKED = 64
@@ -191,7 +192,7 @@ def _histogram(ax: Axes, data: np.ndarray, height: float) -> None:
 
 
 def _scalars(values: Any) -> np.ndarray:
-    values = values.values if isinstance(values, TetMesh) else values
+    values = used_values(values) if isinstance(values, TetMesh) else values
     data = np.asarray(as_floats("values", values), np.float64).ravel()
     if len(data) == 0:
         raise ValueError("There are no values: leave them out.")

@@ -1,5 +1,7 @@
 """Hardware-assisted visibility sorting (Callahan, Ikits, Comba and Silva 2005), as a scan.
 
+doi:10.1109/TVCG.2005.46
+
 Faces are rasterised in an order that is nearly right (`jaxvr.order`, `trace.stream`), and each
 pixel puts its fragments right in a buffer of k entries. A fragment that arrives at a full buffer
 dislodges the closest of the k + 1, and the closest two are the ends of a segment (section 3.2 and

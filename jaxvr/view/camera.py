@@ -115,16 +115,22 @@ class Camera:
         width: int = 512,
         height: int = 512,
         *,
+        up: Any = (0.0, 1.0, 0.0),
         dtype: Any = None,
     ) -> Camera:
         """A pinhole camera on a sphere round the volume; at zoom 1 its bounding ball fits the fov.
 
         target = centre of the bounding box, R = half its diagonal, eye = target
-        + R/sin(fov/2)/zoom * (cos(el) sin(az), sin(el), cos(el) cos(az)), up = (0, 1, 0). Azimuth
-        az, elevation el and fov are in degrees; from azimuth 0 one looks along -z. The dtype
-        defaults to that of `volume.bounds()`. Raises ValueError as `look_at` does, for zoom <= 0,
-        and for an elevation of +-90 degrees (up would point along the view: use `look_at` with
-        another up).
+        + R/sin(fov/2)/zoom * (cos(el) sin(az), sin(el), cos(el) cos(az)). Azimuth az, elevation el
+        and fov are in degrees; from azimuth 0 one looks along -z.
+
+        up (3,): what elevation 90 looks down from, known numbers; those three then are parts of the
+        axes that `orbit_axes(up)` gives. With z up, (0, 0, 1), the eye goes along
+        (cos(el) cos(az), cos(el) sin(az), sin(el)).
+
+        The dtype defaults to that of `volume.bounds()`. Raises ValueError as `look_at` does, for
+        zoom <= 0, and for an elevation of +-90 degrees (up would point along the view: use
+        `look_at` with another up).
         """
         lo, hi = _bounds_of(volume)
         given = getattr(lo, "dtype", None)
@@ -143,8 +149,12 @@ class Camera:
         distance = radius / jnp.sin(jnp.deg2rad(angle) / 2) / magnification
         az, el = jnp.deg2rad(az), jnp.deg2rad(el)
         outward = jnp.stack([jnp.cos(el) * jnp.sin(az), jnp.sin(el), jnp.cos(el) * jnp.cos(az)])
+        axes = orbit_axes(up)
+        if (axes != np.eye(3)).any():
+            x, y, z = (jnp.asarray(axis, dtype) for axis in axes)
+            outward = outward[0] * x + outward[1] * y + outward[2] * z
         eye = target + distance * outward
-        return _make(eye, target, (0.0, 1.0, 0.0), angle, None, width, height, dtype)
+        return _make(eye, target, up, angle, None, width, height, dtype)
 
     @staticmethod
     def sphere(
@@ -162,8 +172,8 @@ class Camera:
 
         View k has sin(elevation) = 1 - (2k + 1)/n and azimuth k times the golden angle
         (González, "Measurement of areas on a sphere using Fibonacci and latitude-longitude
-        lattices", 2010); no view looks along up. DiffDVR (Weiss and Westermann, 2021) fits to
-        eight such views.
+        lattices", 2010, doi:10.1007/s11004-009-9257-x); no view looks along up. DiffDVR (Weiss and
+        Westermann, 2021, doi:10.1109/TVCG.2021.3114769) fits to eight such views.
         """
         n = _positive("n", n)
         golden = 180.0 * (3.0 - math.sqrt(5.0))
@@ -202,7 +212,7 @@ class Camera:
         """This view as a new vtkCamera, or set in the camera, renderer or plotter `into`.
 
         Returns the vtkCamera. `camera.to_vtk(plotter)` sets a pyvista.Plotter's camera and the size
-        of its window. VTK makes view up a unit vector. Needs VTK: `pip install 'jaxvr[peers]'`.
+        of its window. VTK makes view up a unit vector. Needs VTK: `pip install vtk`.
         """
         from jaxvr.view import camera_vtk
 
@@ -279,6 +289,26 @@ def _make_rays(camera: Camera) -> tuple[Array, Array]:
 
 def _normalize(v: Array) -> Array:
     return v / jnp.sqrt(jnp.sum(v * v, axis=-1, keepdims=True))
+
+
+def orbit_axes(up: Any) -> np.ndarray:
+    """A right-handed frame (3, 3) float64: what azimuth 90, elevation 90 and neither look from.
+
+    The second row is `up` (3,), as a unit vector. The third is the axis of the world that is
+    farthest from it, among equals z before x before y, made perpendicular to it. So the frame is
+    the world's own where y is up. Raises ValueError for what is no direction.
+    """
+    if not is_concrete(up):
+        raise ValueError("up must be known numbers: an orbit's axes are chosen by them.")
+    up = np.asarray(_vector("up", up, None), np.float64)
+    if not up.any():
+        raise ValueError("up is the zero vector; pass a direction such as (0, 1, 0).")
+    y = _unit(up)
+    world = np.eye(3)[[2, 0, 1]]
+    z = world[np.argmin(np.abs(world @ y))]
+    z = z - (z @ y) * y
+    z /= np.linalg.norm(z)
+    return np.stack([np.cross(y, z), y, z])
 
 
 def _bounds_of(volume: Any) -> tuple[Any, Any]:

@@ -49,7 +49,7 @@ def write(camera: Camera, into: Any = None) -> Any:
         try:
             from vtkmodules.vtkRenderingCore import vtkCamera
         except ImportError as e:
-            raise ImportError("to_vtk needs VTK: pip install 'jaxvr[peers]'") from e
+            raise ImportError("to_vtk needs VTK: pip install vtk") from e
         into = vtkCamera()
     view = _view(into)
     view.SetPosition(*np.asarray(camera.eye, float).tolist())

@@ -12,8 +12,6 @@ volume have no sign of their own; they get the one that fits their neighbours (`
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from . import packing
 
@@ -88,8 +86,15 @@ def match_faces(welded_rows: np.ndarray) -> np.ndarray:
 
 def components(n: int, pairs: np.ndarray) -> tuple[int, np.ndarray]:
     """Number of face-connected components of n cells, and the label (n,) of each."""
-    one = np.ones(len(pairs), np.int8)
-    graph = coo_matrix((one, (pairs[:, 0], pairs[:, 2])), shape=(n, n))
+    return _connected(n, pairs[:, 0], pairs[:, 2])
+
+
+def _connected(n: int, first: np.ndarray, second: np.ndarray) -> tuple[int, np.ndarray]:
+    """Components of a graph of n nodes with edges between `first` and `second` (E,)."""
+    from scipy.sparse import coo_matrix  # here, since these two take a while to import
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(n, n))
     count, label = connected_components(graph, directed=False)
     return int(count), label
 
@@ -178,8 +183,7 @@ def combinatorial(
     patches, patch = components(n, pairs[agrees])
     p, q = patch[c[~agrees]], patch[m[~agrees]]
     rows, cols = np.r_[p, p + patches], np.r_[q + patches, q]
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, cols)), shape=(2 * patches,) * 2)
-    count, label = connected_components(graph, directed=False)
+    count, label = _connected(2 * patches, rows, cols)
     upright, other = label[:patches], label[patches:]
     one_sided = upright == other
     # each orientable component appears twice, mirrored: keep the copy with more upright volume
@@ -217,9 +221,7 @@ def _two_copies(neighbors: np.ndarray) -> tuple[int, np.ndarray]:
     m, f = packing.cell_of(words), packing.corner_of(words)
     other = (k + f) % 2 == 0
     rows, cols = np.r_[c, c + n], np.r_[np.where(other, m + n, m), np.where(other, m, m + n)]
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, cols)), shape=(2 * n, 2 * n))
-    count, label = connected_components(graph, directed=False)
-    return int(count), label
+    return _connected(2 * n, rows, cols)
 
 
 def entries_agree(neighbors: np.ndarray, boundary: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from .connectivity import components
 from .packing import cell_of
 from .quality import quality
+from .statistics import value_range
 
 if TYPE_CHECKING:
     from .mesh import TetMesh
@@ -40,7 +41,7 @@ def _size(n: int) -> str:
 
 def describe(mesh: TetMesh) -> str:
     """Facts on a concrete mesh, one a line; see `TetMesh.describe`."""
-    values = np.asarray(mesh.values)
+    low, high = value_range(mesh)
     lo, hi = mesh.bounds()
     q = quality(mesh.points, mesh.cells)
     count, largest = count_components(mesh.neighbors)
@@ -55,7 +56,7 @@ def describe(mesh: TetMesh) -> str:
         ("dihedral angles", f"{q.min_dihedral:.3g} to {q.max_dihedral:.6g} degrees"),
         ("edge ratio", f"up to {q.edge_ratio:,.4g}"),
         ("volumes", f"{q.min_volume:.3g} to {q.max_volume:.3g}, {q.volume:.6g} in all"),
-        ("field", f"{field}, {mesh.location} data, {values.min():.6g} to {values.max():.6g}"),
+        ("field", f"{field}, {mesh.location} data, {low:.6g} to {high:.6g}"),
         ("memory", f"{_size(nbytes)}, {nbytes / mesh.n_tets:.0f} bytes per tetrahedron"),
     ]
     width = max(len(label) for label, _ in rows)

@@ -9,9 +9,12 @@ barycentric coordinates. f is taken linear in each cell, g and h constant on eac
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from scipy.sparse import coo_array, csr_array, dia_array
-from scipy.sparse.linalg import cg
+
+if TYPE_CHECKING:  # scipy.sparse takes a while to import
+    from scipy.sparse import csr_array
 
 
 def stiffness(points: np.ndarray, tets: np.ndarray) -> csr_array:
@@ -48,6 +51,8 @@ def load(points: np.ndarray, faces: np.ndarray, flux: np.ndarray | float) -> np.
 
 
 def _assemble(local: np.ndarray, simplices: np.ndarray, n: int) -> csr_array:
+    from scipy.sparse import coo_array
+
     m = simplices.shape[1]
     rows, cols = np.repeat(simplices, m, 1).ravel(), np.tile(simplices, m).ravel()
     return coo_array((local.ravel(), (rows, cols)), shape=(n, n)).tocsr()
@@ -55,6 +60,9 @@ def _assemble(local: np.ndarray, simplices: np.ndarray, n: int) -> csr_array:
 
 def solve(matrix: csr_array, right: np.ndarray, rtol: float = 1e-11) -> np.ndarray:
     """The solution of a symmetric positive definite system, by Jacobi-preconditioned CG."""
+    from scipy.sparse import dia_array
+    from scipy.sparse.linalg import cg
+
     n = len(right)
     inverse = dia_array(
         (np.reciprocal(matrix.diagonal().astype(np.float64))[None], [0]), shape=(n, n)

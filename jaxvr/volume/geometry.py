@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 # Shewchuk, "Adaptive precision floating-point arithmetic and fast robust geometric predicates"
-# (1997), orient3d: |error| <= (7 + 56 u) u * permanent, with u = 2**-53.
+# (1997, doi:10.1007/PL00009321), orient3d: |error| <= (7 + 56 u) u * permanent, with u = 2**-53.
 _BOUND = (7.0 + 56.0 * 2.0**-53) * 2.0**-53
 _CHUNK = 1 << 19
 # Roundings that a coordinate is taken to have gone through, each of half a unit in the last place:

@@ -10,6 +10,7 @@ import numpy as np
 from .._core import svg
 from .._core.brief import is_known
 from .describe import _size, _triple
+from .statistics import used_points, used_values
 
 if TYPE_CHECKING:
     from .mesh import TetMesh
@@ -29,10 +30,7 @@ def mesh_html(mesh: TetMesh) -> str | None:
     if cells.dtype.kind == "f" or 0 in (values.size, cells.size):
         return None
     corners = np.asarray(points)
-    # A mark for each point is quicker than a copy of each corner.
-    used = np.zeros(len(corners), bool)
-    used[np.asarray(cells).reshape(-1)] = True
-    corners, numbers = corners[used], np.asarray(values)
+    corners, numbers = corners[used_points(mesh)], used_values(mesh)
     low, high = float(numbers.min()), float(numbers.max())
     name = mesh.report.field or "values"
     rows = [

@@ -1,16 +1,17 @@
 """Refinement of degenerate cells, those that are large but thin.
 
 Paper: Callahan, Ikits, Comba and Silva, "Hardware-Assisted Visibility Sorting for Unstructured
-Volume Rendering" (2005), section 5. They find that such cells bring faces, sorted by their
-centroids, far out of visibility order, and propose to look for the cells that digress most from
-the Delaunay property (no point in the circumsphere) and to subdivide them into smaller and more
-symmetric ones. How far a cell digresses and how it is cut they leave open: here the first is
-`delaunay_deviation`, and cuts are longest-edge bisections (Rivara, "New longest-edge algorithms for
-the refinement and/or improvement of unstructured triangulations", 1997). From the longest edge of a
-chosen cell one goes on to the longest of all edges of the cells round it, until an edge is the
-longest in each of its cells; that edge is bisected, and all those cells with it. So faces go on
-matching, no cell is cut across a shorter edge, and none twice in a round. Edges are compared by
-welded ids, so both sides of a seam are cut alike, each with a midpoint of its own (see `weld`).
+Volume Rendering" (2005, doi:10.1109/TVCG.2005.46), section 5. They find that such cells bring
+faces, sorted by their centroids, far out of visibility order, and propose to look for the cells
+that digress most from the Delaunay property (no point in the circumsphere) and to subdivide them
+into smaller and more symmetric ones. How far a cell digresses and how it is cut they leave open:
+here the first is `delaunay_deviation`, and cuts are longest-edge bisections (Rivara, "New
+longest-edge algorithms for the refinement and/or improvement of unstructured triangulations",
+1997). From the longest edge of a chosen cell one goes on to the longest of all edges of the cells
+round it, until an edge is the longest in each of its cells; that edge is bisected, and all those
+cells with it. So faces go on matching, no cell is cut across a shorter edge, and none twice in a
+round. Edges are compared by welded ids, so both sides of a seam are cut alike, each with a midpoint
+of its own (see `weld`).
 
 Which cells first? Of those that deviate clearly the longest: for as many added cells that lowered
 the k that a k-buffer needs more than going by deviation, by its depth as a length, or by products

@@ -67,7 +67,7 @@ def test_a_ray_with_more_entries_than_a_search_keeps(layers):
             layers, origins, directions, transfer, adjoint=jaxvr.Replay(native=n)
         )
     )
-    np.testing.assert_allclose(*images, atol=1e-14)
+    np.testing.assert_allclose(images[0], images[1], atol=1e-14)
 
 
 def test_rays_of_all_directions_in_one_packet(dtype):
@@ -82,7 +82,7 @@ def test_rays_of_all_directions_in_one_packet(dtype):
             mesh, origins.astype(dtype), directions, transfer, adjoint=jaxvr.Replay(native=n)
         )
     )
-    np.testing.assert_allclose(*images, atol=EPS[dtype])
+    np.testing.assert_allclose(images[0], images[1], atol=EPS[dtype])
     assert np.asarray(images[0])[::3, 3].min() > 0  # from inside
 
 

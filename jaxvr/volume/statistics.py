@@ -1,0 +1,69 @@
+"""What the values of a mesh are, counted by the space that they fill.
+
+Points that no cell uses are part of a mesh's arrays and of nothing else: no ray meets them, and
+they count in none of these numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .geometry import signed_volumes
+
+if TYPE_CHECKING:
+    from .mesh import TetMesh
+
+
+def used_points(mesh: TetMesh) -> np.ndarray:
+    """Which points (P,) cells use."""
+    used = np.zeros(mesh.n_points, bool)  # a mark for each is quicker than a copy of each corner
+    used[np.asarray(mesh.cells).reshape(-1)] = True
+    return used
+
+
+def used_values(mesh: TetMesh) -> np.ndarray:
+    """The values (n,) that cells use, in the order of the mesh's."""
+    values = np.asarray(mesh.values)
+    return values[used_points(mesh)] if mesh.location == "point" else values.reshape(-1)
+
+
+def value_range(mesh: TetMesh) -> tuple[float, float]:
+    """The least and the largest value that a cell uses."""
+    values = used_values(mesh)
+    return float(values.min()), float(values.max())
+
+
+def weighted_values(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Values (n,) that cells use and the part (n,) float64 of the volume that each stands for.
+
+    A quarter of a cell goes with the value of each of its corners. Where cells have no volume, each
+    counts the same. The parts add up to 1.
+    """
+    size = np.abs(signed_volumes(np.asarray(mesh.points), np.asarray(mesh.cells))[0])
+    size = np.asarray(size, np.float64)
+    if not size.sum() > 0:
+        size = np.ones(len(size))
+    size = size / size.sum()
+    values = np.asarray(mesh.values)
+    if mesh.location == "cell":
+        return values, size
+    quarter = np.repeat(size / 4, 4)
+    if mesh.location == "corner":
+        return values.reshape(-1), quarter
+    parts = np.bincount(np.asarray(mesh.cells).reshape(-1), quarter, minlength=mesh.n_points)
+    used = used_points(mesh)
+    return values[used], parts[used]
+
+
+def quantiles(mesh: TetMesh, parts: Sequence[float]) -> list[float]:
+    """For each part, from 0 to 1, the least value that with those below it fills so much of the
+    volume; 0 and 1 give the range."""
+    values, weights = weighted_values(mesh)
+    order = np.argsort(values, kind="stable")
+    values, reached = values[order], np.cumsum(weights[order])
+    at = np.searchsorted(reached, np.asarray(parts) * reached[-1])
+    at = np.where(np.asarray(parts) >= 1, len(values) - 1, np.minimum(at, len(values) - 1))
+    return [float(values[k]) for k in at]
