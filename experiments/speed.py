@@ -100,7 +100,8 @@ def fit_iteration(segments: Any, transfer: Any, image: Any) -> Callable[[], Any]
     nouns = jaxvr.Analytic(), jaxvr.Over(), jaxvr.Replay(), jaxvr.RayCast()
     gradient, raw = Objective(l1, *nouns).gradient, parameters.raw()
     once = Control(iterations=1, progress=False)
-    return lambda: run(gradient, raw, lambda i: inputs, 1, None, 0.1, once, None, lambda n: {}).parameters
+    rest = (1, None, 0.1, once, None, lambda n: {})
+    return lambda: run(gradient, raw, lambda i: inputs, *rest).parameters
 
 
 def few_tasks(mesh: Any, camera: Any, transfer: Any, segments: Any) -> Tasks:
