@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvr._core.checks import (
+    BRIGHTEST,
     as_floats,
     is_concrete,
     require_finite,
@@ -33,10 +34,12 @@ def background_of(background: Any) -> Array | None:
     """RGB (3,), or None."""
     if background is None:
         return None
-    background = as_floats("background", background)
+    given, background = background, as_floats("background", background)
     if background.shape != (3,):
         raise ValueError(f"background must be RGB with shape (3,), but has {background.shape}.")
-    require_light("background", background)
+    # In integers black and white are what they are in floats; dark bytes are not.
+    whole = is_concrete(given) and np.asarray(given).dtype.kind in "iu"
+    require_light("background", background, most=1 if whole else BRIGHTEST)
     return jnp.asarray(background)
 
 

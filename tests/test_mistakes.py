@@ -275,7 +275,8 @@ def test_what_stands_in_the_place_of_something_else(mesh, camera):
 
 
 def test_colours_of_a_background_in_bytes(mesh, camera, tmp_path):
-    for background in ((255, 255, 255), (0, 128, 0)):
+    dark = np.array([2, 8, 5], np.uint8)
+    for background in ((255, 255, 255), (0, 128, 0), dark, jnp.asarray(dark)):
         with pytest.raises(ValueError, match="background holds .* from 0 to 1. Divide .* by 255"):
             jaxvr.render(mesh, camera, ramp(), background=background)
         with pytest.raises(ValueError, match="background holds .* from 0 to 1. Divide .* by 255"):

@@ -89,16 +89,16 @@ def refuse_bytes(name: str, x: Any, hint: str = "") -> None:
         raise ValueError(f"{what} {hint}".rstrip())
 
 
-def require_light(name: str, x: Any) -> None:
-    """ValueError for colours with NaN or infinite entries, and for bytes, which `BRIGHTEST` tells
-    from light (if concrete)."""
+def require_light(name: str, x: Any, most: float = BRIGHTEST) -> None:
+    """ValueError for colours with NaN or infinite entries, and for bytes, which `most` tells from
+    light (if concrete)."""
     require_finite(name, x)
     if not is_concrete(x):
         return
-    most = float(np.max(np.asarray(x), initial=0))
-    if most > BRIGHTEST:
+    found = float(np.max(np.asarray(x), initial=0))
+    if found > most:
         raise ValueError(
-            f"{name} holds {most:g}, but colours are linear light from 0 to 1. Divide bytes by 255."
+            f"{name} holds {found:g}, but colours are linear light from 0 to 1. Divide bytes by 255."
         )
 
 
