@@ -18,6 +18,8 @@ from jaxvr.volume.geometry import signed_volumes
 DEPTH = 15.0
 # Parts of the volume whose values the control points span.
 QUANTILES = (0.01, 0.99)
+# A part of the range that is rounding, and no field to look at.
+NOISE = 1e-6
 UPS = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0), "x": (1.0, 0.0, 0.0)}
 
 
@@ -39,8 +41,8 @@ def default_transfer(
 
     The control points span the field's quantiles by volume, from 1 to 99 % of it, so that a few
     cells of extreme values do not take the colours of all others. What lies beyond has the colour
-    and the extinction of the nearer end. Where these two are one value, as in a field that is 0
-    nearly everywhere, the whole range is spanned.
+    and the extinction of the nearer end. Where these two are one value but for rounding (less than
+    1e-6 of the range), as in a field that is 0 nearly everywhere, the whole range is spanned.
 
     Args:
       volume: whose values and size in space are taken; points that no cell uses do not count.
@@ -64,10 +66,12 @@ def default_transfer(
         )
     volume = volume_of(volume)
     low, high = statistics.quantiles(volume, quantiles)
-    if not high > low:
-        low, high = statistics.value_range(volume)
-    positions = np.linspace(low, high, points) if high > low else np.array([low])
-    ramp = np.linspace(0, 1, len(positions)) if high > low else np.ones(1)
+    least, most = statistics.value_range(volume)
+    if not high - low > NOISE * (most - least):
+        low, high = least, most
+    # Where few numbers lie between the two, there are fewer points.
+    positions = np.unique(np.linspace(low, high, points).astype(volume.dtype))
+    ramp = np.linspace(0, 1, len(positions)) if len(positions) > 1 else np.ones(1)
     extinctions = (depth / diagonal(volume) * ramp).astype(volume.dtype)
     return TransferFunction.from_colormap(colormap, positions, extinctions, dtype=volume.dtype)
 

@@ -129,3 +129,22 @@ def test_an_orbit_about_another_axis(up):
     np.testing.assert_array_equal(one.eye, jaxvr.Camera.orbit(mesh).eye)
     with pytest.raises(ValueError, match="zero vector"):
         jaxvr.Camera.orbit(mesh, up=(0, 0, 0))
+
+
+def test_rounding_noise_takes_no_colours():
+    """A ball of 1 in less than a hundredth of the volume, and noise of 1e-9 elsewhere."""
+    mesh = lattice(lambda p: 1e-9 * p[..., 0], (10, 10, 10), "cell")
+    values = np.asarray(mesh.values).copy()
+    values[:5] = 1.0
+    ends = jaxvr.default_transfer(mesh.replace(values=values)).positions[np.array([0, -1])]
+    assert ends[0] < 1e-9 and ends[1] == 1.0
+
+
+def test_few_numbers_between_the_ends_make_few_points():
+    """A pressure of which float32 keeps some steps: positions stay apart."""
+    mesh = jaxvr.datasets.box((6, 5, 4), dtype="float32")
+    mesh = mesh.replace(values=101325 + np.float32(0.05) * mesh.points[:, 0])
+    transfer = jaxvr.default_transfer(mesh)
+    positions = np.asarray(transfer.positions)
+    assert 2 <= len(positions) < 33 and (np.diff(positions) > 0).all()
+    assert positions[0] >= 101325 and positions[-1] <= np.float32(101325.05)

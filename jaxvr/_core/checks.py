@@ -98,7 +98,8 @@ def require_light(name: str, x: Any, most: float = BRIGHTEST) -> None:
     found = float(np.max(np.asarray(x), initial=0))
     if found > most:
         raise ValueError(
-            f"{name} holds {found:g}, but colours are linear light from 0 to 1. Divide bytes by 255."
+            f"{name} holds {found:g}, but colours are linear light from 0 to 1. Divide bytes by "
+            "255."
         )
 
 

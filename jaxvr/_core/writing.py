@@ -8,6 +8,7 @@ what a killed process left is removed by `require_place`, later.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import platform
@@ -45,6 +46,8 @@ def beside(path: Any) -> Iterator[Path]:
     if place.exists() and not stat.S_ISREG(place.stat().st_mode) and not place.is_dir():
         yield place  # a device or a pipe: nothing can take its place
         return
+    if place.is_file() and not os.access(place, os.W_OK):  # which a new name would get round
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(place))
     name = f"{_mark(place)}{os.getpid()}-{secrets.token_hex(6)}{place.suffix[:16]}"
     part = place.with_name(name)
     os.close(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -88,6 +91,8 @@ def require_place(path: Any, what: str) -> None:
             raise IsADirectoryError(f"{what} cannot be written to {shown(path)}: it is a folder.")
         if place.exists() and not place.is_file():
             return
+        if place.is_file() and not os.access(place, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(place))
         _sweep(place)
         part = place.with_name(f"{_mark(place)}{os.getpid()}-{secrets.token_hex(6)}")
         try:

@@ -6,6 +6,7 @@ its result is worth more than its checkpoint, and a warning says what could not 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -46,7 +47,9 @@ class Keeper:
     """
 
     def __init__(self, path: Any, every: int, about: Callable[[int], dict[str, Any]]):
-        self._path, self._every, self._about = path, every, about
+        # Where it was when the fit began, wherever the process goes meanwhile.
+        self._path = None if path is None else os.path.abspath(os.path.expanduser(path))
+        self._every, self._about = every, about
         self._failed, self._saved = False, 0
 
     def restored(self, state: Any, iterations: int) -> tuple[Any, list[float]]:

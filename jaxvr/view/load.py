@@ -24,6 +24,7 @@ _MARGIN = 1 / 510  # half a step of 8 bits
 _FULL = {np.dtype("u1"): 255, np.dtype("u2"): 65535}
 # PNG's ways to store 16 bits, and those that read the same bytes so that the lower ones come out.
 _LOWER = {"RGB;16B": "RGB;16L", "RGBA;16B": "RGBA;16L"}
+_ORIENTATION = 0x0112  # a tag of EXIF
 
 
 class PictureWarning(UserWarning):
@@ -75,7 +76,7 @@ def load_image(
         raise FileNotFoundError(f"There is no file {name}.")
     if not place.is_file():
         raise ValueError(f"{name} is no file.")
-    suffix = place.suffix.lower()
+    suffix = (os.path.splitext(os.fspath(path))[1] or place.suffix).lower()  # links may have none
     read = {".npy": _npy, ".exr": _exr}.get(suffix, _pillow)
     try:
         pixels, coded, straight = read(place)
@@ -197,11 +198,11 @@ def _pillow(place: Path) -> tuple[np.ndarray, str | None, bool]:
             if transparent is not None:
                 opaque = (pixels != np.asarray(transparent)).any(-1, keepdims=True)
                 pixels = np.concatenate([pixels, np.where(opaque, 65535, 0)], -1).astype(np.uint16)
-            return pixels, coded, True
+            return _upright(pixels, picture.getexif().get(_ORIENTATION, 1)), coded, True
         mode = picture.mode
         if mode in ("RGBa", "La"):
             picture = picture.convert("RGBA")  # Pillow's way to divide
-        elif mode == "P" or (mode in ("L", "RGB") and transparent is not None):
+        elif mode == "P" or (mode in ("1", "L", "RGB") and transparent is not None):
             picture = picture.convert("RGB" if transparent is None else "RGBA")
         elif mode == "PA":
             picture = picture.convert("RGBA")
@@ -213,6 +214,17 @@ def _pillow(place: Path) -> tuple[np.ndarray, str | None, bool]:
             raise _Told(f"has the colour space {mode}. Convert it to RGB first.")
         pixels = np.asarray(ImageOps.exif_transpose(picture))
     return pixels[..., None] if pixels.ndim == 2 else pixels, coded, True
+
+
+def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Turned and mirrored as EXIF says (1 to 8), for which Pillow has pictures of 8 bits only."""
+    if orientation in (5, 6, 7, 8):
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return pixels
 
 
 def _sixteen_bits(place: Path, picture: Any, way: str) -> np.ndarray:

@@ -18,8 +18,10 @@ import pytest
 
 import jaxvr
 from jaxvr._core import writing
+from jaxvr._core.writing import require_place, whole_file
 from jaxvr.fit import CheckpointWarning, Ordered, Sigmoid, Softplus, fit_parameters
 from jaxvr.fit import checkpoint as files
+from jaxvr.fit.resume import Keeper
 
 SIZE = 6
 RATE = optax.cosine_decay_schedule(0.2, 9)
@@ -443,3 +445,26 @@ def test_the_experiment_on_faults_finds_none():
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "kills, checkpoints" in done.stdout and "fault" not in done.stdout
+
+
+def test_a_relative_path_stays_where_the_fit_began(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    keeper = Keeper("rel.npz", 1, lambda n: {})
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    keeper.step(START, [1.0])
+    assert files.load(tmp_path / "rel.npz", START, {})[1] == [1.0]
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX modes")
+def test_a_file_that_may_not_be_written_is_not_replaced(tmp_path, monkeypatch):
+    place = tmp_path / "a.npz"
+    place.write_bytes(b"kept")
+    access = os.access  # root may write to anything
+    monkeypatch.setattr(os, "access", lambda p, mode: access(p, mode) and mode != os.W_OK)
+    with pytest.raises(PermissionError), whole_file(place) as file:
+        file.write(b"new")
+    with pytest.raises(PermissionError, match="checkpoint cannot be written to .*a.npz"):
+        require_place(place, "The checkpoint")
+    assert place.read_bytes() == b"kept" and list(tmp_path.iterdir()) == [place]

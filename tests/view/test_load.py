@@ -236,3 +236,30 @@ def test_measures_in_bytes_say_so():
     assert float(jaxvr.psnr(BYTES % 200, BYTES % 200 + 2, peak=255)) == pytest.approx(
         want, rel=1e-5
     )
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_of_16_bits_are_turned_like_those_of_8(orientation, tmp_path):
+    grey = np.arange(24, dtype=np.uint8).reshape(4, 6)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    for name, pixels in (("8.png", grey), ("16.png", grey.astype(np.uint16) * 257)):
+        Image.fromarray(pixels).save(tmp_path / name, exif=exif)
+    eight, sixteen = (jaxvr.load_image(tmp_path / name, srgb=False) for name in ("8.png", "16.png"))
+    assert eight.shape == ((4, 6, 4) if orientation < 5 else (6, 4, 4))
+    np.testing.assert_array_equal(eight, sixteen)
+
+
+def test_one_bit_may_be_transparent(tmp_path):
+    picture = Image.fromarray(np.array([[0, 255], [255, 0]], np.uint8)).convert("1")
+    picture.save(tmp_path / "a.png", transparency=0)
+    found = jaxvr.load_image(tmp_path / "a.png", srgb=False)
+    assert found[..., 3].tolist() == [[0, 1], [1, 0]]
+
+
+def test_a_link_to_a_file_without_a_suffix(tmp_path):
+    image = np.full((2, 3, 4), 0.25, np.float32)
+    np.save(tmp_path / "a.npy", image)
+    (tmp_path / "a.npy").rename(tmp_path / "blob")
+    (tmp_path / "link.npy").symlink_to(tmp_path / "blob")
+    np.testing.assert_array_equal(jaxvr.load_image(tmp_path / "link.npy"), image)
