@@ -229,6 +229,7 @@ def _data(volume: Any) -> TetMesh:
 def _look(volume: Any) -> TransferFunction:
     """The transfer function of a vtkVolume."""
     mapper, look = volume.GetMapper(), volume.GetProperty()
+    planes = mapper.GetClippingPlanes()
     if mapper.GetBlendMode() != 0:
         raise ValueError(
             "The volume is not composited (its blending is another one), and jaxvr does nothing "
@@ -241,6 +242,8 @@ def _look(volume: Any) -> TransferFunction:
         for name, on in (
             ("shading", look.GetShade()),
             ("opacity by gradient", not look.GetDisableGradientOpacity() and _by_gradient(look)),
+            ("clipping planes", planes is not None and planes.GetNumberOfItems() > 0),
+            ("cropping", getattr(mapper, "GetCropping", int)()),
         )
         if on
     ]

@@ -128,6 +128,8 @@ def test_a_volume_that_was_moved():
 
 
 def test_what_jaxvr_does_not_draw_is_told():
+    from vtkmodules.vtkCommonDataModel import vtkPlane
+
     plotter, volumes = plotter_of(lattice(), lattice(3))
     with pytest.raises(ValueError, match="shows 2 volumes"):
         plotter.jaxvr.scene()
@@ -142,6 +144,14 @@ def test_what_jaxvr_does_not_draw_is_told():
         pyvista.Plotter(off_screen=True).jaxvr.scene()
     with pytest.warns(UserWarning, match="no shading"):
         plotter_of(lattice(), shade=True)[0].jaxvr.scene()
+    cut, (volume,) = plotter_of(lattice())
+    volume.mapper.AddClippingPlane(vtkPlane())
+    with pytest.warns(UserWarning, match="no clipping planes"):
+        cut.jaxvr.scene()
+    cut, (volume,) = plotter_of(lattice())
+    volume.mapper.SetCropping(True)
+    with pytest.warns(UserWarning, match="no cropping"):
+        cut.jaxvr.scene()
     with pytest.raises(ValueError, match="not composited"):
         plotter_of(lattice(), blending="maximum")[0].jaxvr.scene()
     with pytest.raises(ValueError, match="set_background"):
