@@ -291,21 +291,15 @@ def test_a_reader_that_crashes(tmp_path, monkeypatch):
     """What it does to its process does not reach this one; the next file is read."""
     path = tmp_path / "a.vtu"
     write_mesh(path, datasets.box((1, 1, 1)))
-    given = process.child.receive
-
-    def killed(stream):
-        for worker in working:
-            worker.kill()
-        return given(stream)
-
-    working = []
-    start = process._start
-    monkeypatch.setattr(process, "_start", lambda: working.append(start()) or working[-1])
+    crashing = tmp_path / "child.py"  # takes the request, and is killed
+    crashing.write_text(
+        "import os, sys\nsys.stdin.buffer.read(1)\nos.write(1, b'!')\nos.kill(os.getpid(), 9)\n"
+    )
+    monkeypatch.setattr(process, "_CHILD", crashing)
     monkeypatch.setattr(process._pool, "idle", [])
-    monkeypatch.setattr(process.child, "receive", killed)
     with pytest.raises(ValueError, match="takes more memory"):  # as the system ends those that do
         read_mesh(path)
-    assert [w.poll() for w in working] == [-9]
+    assert process._pool.idle == []
     monkeypatch.undo()
     assert read_mesh(path).n_tets == 6
 
