@@ -219,7 +219,10 @@ def read_mesh(
     cells = {t: range(c) if isinstance(c, int) else c for t, c in got["cells"].items()}
     try:
         if values is not None:
-            values = values(got["points"]) if isinstance(values, Callable) else values
+            if isinstance(values, Callable):
+                values = values(got["points"])
+            else:
+                _require_order(values, location, len(got["points"]), got["reordered"])
         else:
             values, location = got["values"], got["location"]
         return _from_cells(
@@ -231,6 +234,18 @@ def read_mesh(
         if file.name not in message:
             message = f"{file.name}: {message}"
         raise ValueError(message) from e
+
+
+def _require_order(values: Any, location: str | None, n_points: int, why: str) -> None:
+    """ValueError for one array of cells where the cells of the file come in another order."""
+    if not why or isinstance(values, dict) or location == "point":
+        return
+    if location is None and len(np.shape(values)) == 1 and len(values) == n_points:
+        return
+    raise ValueError(
+        f"values cannot be one array for the cells of this file, whose order is not kept: {why}. "
+        "Pass values at its points, a function of the points, or a dict by type of cell."
+    )
 
 
 def write_mesh(path: Any, mesh: TetMesh) -> None:

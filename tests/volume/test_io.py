@@ -394,3 +394,27 @@ def test_repairs_of_more_than_a_tenth(part, tmp_path):
             assert volume(read_mesh(tmp_path / "a.vtu", "t")) == pytest.approx(
                 125 * 1.002, rel=1e-6
             )
+
+
+def test_cell_values_where_types_take_turns(tmp_path):
+    points, hexes = file_makers.lattice(2)
+    grid = file_makers.unstructured([(12, hexes[:1]), (10, hexes[1:2, :4])], points)
+    import pyvista as pv
+
+    a, b, c = hexes[0][[0, 1, 3, 4]], hexes[1], hexes[3][[0, 1, 3, 4]]
+    cells = np.concatenate([[4], a, [8], b, [4], c])
+    grid = pv.UnstructuredGrid(cells, np.array([10, 12, 10], np.uint8), points)
+    grid.save(str(tmp_path / "a.vtu"))
+    with pytest.raises(ValueError, match="types of cells take turns.*dict by type"):
+        read_mesh(tmp_path / "a.vtu", values=[10.0, 20.0, 30.0])
+    mesh = quietly(tmp_path / "a.vtu", values={"tetra": [10.0, 30.0], "hexahedron": [20.0]})
+    assert sorted(set(np.asarray(mesh.values).tolist())) == [10.0, 20.0, 30.0]
+
+
+def test_cell_values_where_groups_take_turns(msh):
+    lines = msh.read_text().replace(
+        "3 4 2 7 1 10 30 20 50", "3 4 2 7 1 10 30 20 50\n4 4 2 8 1 10 20 30 50"
+    )
+    msh.write_text(lines.replace("$Elements\n3\n", "$Elements\n4\n"))
+    with pytest.raises(ValueError, match="physical groups.*take turns"):
+        read_mesh(msh, values=[1.0, 2.0, 3.0])

@@ -77,6 +77,7 @@ class Content:
     where not all do. active: the scalars that the file names. blocks: the names of all blocks.
     steps: times of all steps, `step` the index of the one that was read; field_steps: (name,
     location) to times, where fields have steps of their own. notes: what the caller is warned of.
+    reordered: why the rows of parts are not those of the file, "" where they are.
     raw: points and cells that the reader found, before any are left out or cut.
     """
 
@@ -93,6 +94,7 @@ class Content:
     field_steps: dict[tuple[str, str], tuple[float, ...]] = dataclasses.field(default_factory=dict)
     notes: list[str] = dataclasses.field(default_factory=list)
     reader: str = ""
+    reordered: str = ""
     raw: tuple[int, int] | None = None
 
     @property
@@ -226,4 +228,5 @@ def join(contents: list[Content], names: list[str]) -> Content:
         blocks=tuple(names),
         notes=list(dict.fromkeys(n for c in contents for n in c.notes)),
         reader=contents[0].reader,
+        reordered=next((c.reordered for c in contents if c.reordered), ""),
     )

@@ -43,6 +43,7 @@ class _File:
     )
     names: dict[tuple[int, int], str] = dataclasses.field(default_factory=dict)
     physical: dict[tuple[int, int], list[int]] = dataclasses.field(default_factory=dict)
+    regrouped: bool = False  # elements stand in another order than in the file
     data: dict[str, list[_Data]] = dataclasses.field(
         default_factory=lambda: {"NodeData": [], "ElementData": [], "ElementNodeData": []}
     )
@@ -211,6 +212,7 @@ def _elements_2(file: _File, name: str, body: bytes) -> None:
     if n < 0 or n > s.left:
         raise Trouble("damaged", f"$Elements counts {n} elements in {len(rest)} bytes")
     groups: dict[tuple[int, int], list[np.ndarray]] = {}
+    sequence: list[tuple[int, int]] = []  # (type, physical group) of each run of elements
 
     def add(kind: int, rows: np.ndarray, tags: int) -> None:
         physical = rows[:, 1] if tags else np.zeros(len(rows), np.int64)
@@ -225,7 +227,11 @@ def _elements_2(file: _File, name: str, body: bytes) -> None:
             kind, m, tags = s.ints(3)
             if m < 1 or m > left or tags < 0:
                 raise Trouble("damaged", f"$Elements has a block of {m} where {left} are left")
-            add(int(kind), s.table(int(m), 1 + int(tags) + _type(kind)[1]), int(tags))
+            rows = s.table(int(m), 1 + int(tags) + _type(kind)[1])
+            for tag in rows[:, 1].tolist() if tags else [0]:
+                if sequence[-1:] != [(int(kind), tag)]:
+                    sequence.append((int(kind), tag))
+            add(int(kind), rows, int(tags))
             left -= int(m)
     else:
         lines: dict[tuple[int, int], list[list[int]]] = {}
@@ -240,6 +246,9 @@ def _elements_2(file: _File, name: str, body: bytes) -> None:
                     raise IndexError
             except (ValueError, IndexError):
                 raise Trouble("damaged", f"$Elements: {line[:60]!r} is no element") from None
+            key = (kind, row[3] if tags else 0)
+            if sequence[-1:] != [key]:
+                sequence.append(key)
             lines.setdefault((kind, tags), []).append(row[:1] + row[3:])
             left -= 1
         if left:
@@ -249,6 +258,10 @@ def _elements_2(file: _File, name: str, body: bytes) -> None:
                 add(kind, np.array(rows, np.int64), tags)
             except OverflowError as e:
                 raise Trouble("damaged", f"$Elements: {e}") from None
+    solid = {k: is_solid(_type(k)[0]) for k, _ in sequence}
+    found = [key for key in sequence if solid[key[0]]]
+    if found != [key for key in groups if solid[key[0]]]:
+        file.regrouped = True
     for (kind, tag), parts in groups.items():
         rows = np.concatenate(parts)
         file.elements.append((kind, tag, rows[:, 0], rows[:, 1:]))
@@ -336,6 +349,8 @@ def _content(file: _File, ask: Ask) -> Content:
         return order[at]
 
     content = Content(points=file.points, parts=[])
+    if file.regrouped:
+        content.reordered = "elements of physical groups or types take turns in it"
     element_ids, solid_blocks = [], {}
     for number, tag, own, nodes in file.elements:
         kind, _ = TYPES[number]

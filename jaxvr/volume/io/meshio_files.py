@@ -128,6 +128,7 @@ def content_of(mesh: Any) -> Content:
         if block.type.startswith("polyhedron"):
             faces = [[[int(i) for i in f] for f in cell] for cell in block.data]
             tets, parent = polyhedra.cut(content, faces, np.arange(start, start + n))
+            content.reordered = "polyhedra are cut"
             content.parts.append(Part("polyhedron parts", tets))
             rows.append(parent)
         elif is_solid(block.type):
@@ -173,6 +174,7 @@ def _without_ghosts(content: Content) -> None:
         if hidden is not None:
             drawn &= (hidden.astype(int) & NOT_DRAWN["point"] == 0)[part.nodes].all(1)
         if not drawn.all():
+            content.reordered = "ghost cells are left out"
             part.nodes = part.nodes[drawn]
             for arrays in content.cell.values():
                 a = arrays[k]
