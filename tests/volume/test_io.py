@@ -10,8 +10,8 @@ import pytest
 
 from experiments import file_kinds, file_makers
 from jaxvr.volume import Field, TetMesh, datasets, list_fields, read_mesh, write_mesh
-from jaxvr.volume.io import process, registry, sizes
-from jaxvr.volume.io.content import Ask, Trouble
+from jaxvr.volume.io import exodus, fields, meshio_files, process, registry, sizes
+from jaxvr.volume.io.content import Ask, Content, Part, Trouble, join
 
 # What packages that are not among those of the tests write.
 ELSEWHERE = ("gmsh", "netCDF4")
@@ -398,7 +398,6 @@ def test_repairs_of_more_than_a_tenth(part, tmp_path):
 
 def test_cell_values_where_types_take_turns(tmp_path):
     points, hexes = file_makers.lattice(2)
-    grid = file_makers.unstructured([(12, hexes[:1]), (10, hexes[1:2, :4])], points)
     import pyvista as pv
 
     a, b, c = hexes[0][[0, 1, 3, 4]], hexes[1], hexes[3][[0, 1, 3, 4]]
@@ -418,3 +417,53 @@ def test_cell_values_where_groups_take_turns(msh):
     msh.write_text(lines.replace("$Elements\n3\n", "$Elements\n4\n"))
     with pytest.raises(ValueError, match="physical groups.*take turns"):
         read_mesh(msh, values=[1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.su2", "NZONE= 2\nIZONE= 1\nNDIME= 3\n", "2 zones"),
+        ("a.inp", "*PART, NAME=A\n*END PART\n*Part, name=B\n*END PART\n", "2 parts"),
+        ("a.inp", "*INSTANCE, NAME=A, PART=A\n*END INSTANCE\n" * 2, "2 instances"),
+        ("a.inp", "*Instance, name=A, part=A\n 0., 0., 5.\n*End Instance\n", "is moved"),
+        ("a.bdf", "BEGIN BULK\nGRID           1       5     0.0     0.0     0.0\n", "system 5"),
+        ("a.bdf", "BEGIN BULK\nGRID,1,2,0.,0.,0.\n", "system 2"),
+        ("a.bdf", "BEGIN BULK\nGRDSET,,7\n", "system 7"),
+    ],
+)
+def test_files_of_which_a_part_would_be_read_or_misplaced(name, text, words, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=f"kind that is not supported: .*{words}"):
+        read_mesh(tmp_path / name)
+
+
+def test_all_zones_of_a_tecplot_file(tmp_path):
+    zone = "ZONE N=4, E=1, F=FEPOINT, ET=TETRAHEDRON\n"
+    rows = [[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]]
+    text = 'VARIABLES = "X" "Y" "Z" "t"\n'
+    for k in range(2):
+        text += zone + "".join(f"{x + 3 * k} {y} {z} {t + k}\n" for x, y, z, t in rows)
+        text += "1 2 3 4\n"
+    (tmp_path / "a.dat").write_text(text)
+    assert quietly(tmp_path / "a.dat").n_tets == 2
+    with pytest.raises(Trouble, match="2 zones"):
+        meshio_files.read(tmp_path / "a.dat", Ask(), str, ".dat")
+
+
+def test_blocks_whose_field_has_other_components():
+    def block(data):
+        nodes = np.arange(4)[None]
+        return Content(np.eye(4, 3), [Part("tetra", nodes)], cell={"a": [data]})
+
+    both = join([block(np.ones(1)), block(np.ones((1, 3)))], ["one", "two"])
+    with pytest.raises(Trouble, match="1 in 'two' have no value"):
+        fields.arrays_of(both, "f", "a", None)
+    assert "other numbers of components" in both.notes[0]
+
+
+def test_exodus_scalar_with_the_name_of_a_stem():
+    names = ("vel", "velx", "vely", "velz", "u_x", "u_y", "u_z")
+    content = Content(np.eye(4, 3), [], point={n: np.full(4, k) for k, n in enumerate(names)})
+    exodus._vectors(content)
+    assert sorted(content.point) == ["u", "vel", "velx", "vely", "velz"]
+    assert content.point["vel"].tolist() == [0] * 4

@@ -209,12 +209,25 @@ def join(contents: list[Content], names: list[str]) -> Content:
         points.append(content.points)
         start += n
 
+    notes = list(dict.fromkeys(n for c in contents for n in c.notes))
+
     def rows(what: str) -> dict[str, list[np.ndarray | None]]:
         found: dict[str, list[np.ndarray | None]] = {}
         for key in dict.fromkeys(k for c in contents for k in getattr(c, what)):
             column = found.setdefault(key, [])
             for c in contents:
                 column += getattr(c, what).get(key, [None] * len(c.parts))
+            lead = 1 if what == "cell" else 2
+            shapes = [None if a is None else a.shape[lead:] for a in column]
+            first = next((s for s in shapes if s is not None), None)
+            if any(s not in (None, first) for s in shapes):
+                notes.append(
+                    f"Field {key!r} has other numbers of components in some blocks than in the "
+                    "first, and counts as absent there: pass block= to read them."
+                )
+                found[key] = [
+                    a if s == first else None for a, s in zip(column, shapes, strict=True)
+                ]
         return found
 
     return Content(
@@ -226,7 +239,7 @@ def join(contents: list[Content], names: list[str]) -> Content:
         point_blocks={k: tuple(w) for k, w in where.items() if len(w) < len(filled)},
         active=contents[0].active,
         blocks=tuple(names),
-        notes=list(dict.fromkeys(n for c in contents for n in c.notes)),
+        notes=notes,
         reader=contents[0].reader,
         reordered=next((c.reordered for c in contents if c.reordered), ""),
     )

@@ -107,7 +107,11 @@ def _vectors(content: Content) -> None:
         for name in [n for n in group if n.lower().endswith("x")]:
             stem = name[:-1]
             rest = [stem + a for a in ("yz" if name[-1] == "x" else "YZ")]
-            if stem.rstrip("_ ") and all(r in group for r in rest):
+            if (
+                stem.rstrip("_ ")
+                and stem.rstrip("_ ") not in group
+                and all(r in group for r in rest)
+            ):
                 parts: list[Any] = [group.pop(n) for n in (name, *rest)]
                 if group is content.point:
                     content.point[stem.rstrip("_ ")] = np.stack(parts, -1)
