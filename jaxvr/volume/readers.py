@@ -9,6 +9,7 @@ asked for by component, and what is taken where there is a choice is told.
 from __future__ import annotations
 
 import dataclasses
+import operator
 import os
 import shutil
 import uuid
@@ -71,10 +72,14 @@ def _ask(step: Any, block: Any, limit: int | None) -> Ask:
         )
     if isinstance(step, np.integer | np.floating):
         step = step.item()
-    if block is not None and not isinstance(block, str):
-        many = [block] if isinstance(block, int | np.integer) else block
+    if isinstance(block, str):
+        block = str.__str__(block)  # of subclasses, which the reading process does not know
+    elif block is not None:
+        many = [block] if isinstance(block, int | np.integer | np.bool_) else block
         try:
-            block = [b if isinstance(b, str) else int(b) for b in many]
+            if any(isinstance(b, bool | np.bool_) for b in many):
+                raise TypeError
+            block = [str.__str__(b) if isinstance(b, str) else operator.index(b) for b in many]
         except (TypeError, ValueError):
             raise ValueError(
                 f"block must be a name, an index or a list of them, but is {block!r}."
@@ -207,6 +212,11 @@ def read_mesh(
         raise ValueError(
             f'location must be "point", "cell", "corner" or None, but is {location!r}.'
         )
+    if field is not None:
+        if not isinstance(field, str):
+            raise ValueError(f"field must be a name, but is {type(field).__name__}.")
+        field = str.__str__(field)
+    location = None if location is None else str.__str__(location)
     if values is not None and field is not None:
         raise ValueError("Pass a field of the file or values, not both.")
     file = _existing(path)

@@ -1,5 +1,7 @@
 """Kinds of files, and what goes wrong with them: nothing is left out in silence."""
 
+import enum
+import subprocess
 import sys
 import threading
 import warnings
@@ -467,3 +469,60 @@ def test_exodus_scalar_with_the_name_of_a_stem():
     exodus._vectors(content)
     assert sorted(content.point) == ["u", "vel", "velx", "vely", "velz"]
     assert content.point["vel"].tolist() == [0] * 4
+
+
+def test_steps_and_blocks_of_files_without(tmp_path, msh):
+    write_mesh(tmp_path / "a.vtu", datasets.box((1, 1, 1)))
+    (tmp_path / "a.pvd").write_text(
+        '<VTKFile type="Collection"><Collection><DataSet timestep="0.5" file="a.vtu"/>'
+        "</Collection></VTKFile>"
+    )
+    msh.write_text(CORNER + STEP.format(t=0.5, k=0, v=1))
+    image = BY_NAME["VTI"].make(tmp_path).path
+    for path in (tmp_path / "a.vtu", image, tmp_path / "a.pvd", msh):
+        with pytest.raises(ValueError, match="There is no step 7: it has"):
+            read_mesh(path, step=7)
+        with pytest.raises(ValueError, match="There is no block 'x'"):
+            read_mesh(path, block="x")
+        assert read_mesh(path, step=0).n_tets
+    assert read_mesh(tmp_path / "a.pvd", step=0.5).n_tets == 6
+    assert quietly(msh, "temp", step=0.5).n_tets == 2
+    for bad in (True, [0.9], [True], 0.5, np.True_):
+        with pytest.raises(ValueError, match="block must be a name, an index"):
+            read_mesh(msh, block=bad)
+
+
+class Name(enum.StrEnum):
+    TEMP = "temp"
+    LOWER = "lower part"
+    POINT = "point"
+
+
+def test_names_of_the_callers_classes(msh):
+    mesh = quietly(msh, Name.TEMP, location=Name.POINT, block=Name.LOWER)
+    assert mesh.report.field == "temp" and mesh.n_tets == 1
+    assert quietly(msh, Name.TEMP, block=[Name.LOWER]).n_tets == 1
+    with pytest.raises(ValueError, match="field must be a name, but is int"):
+        read_mesh(msh, 3)  # type: ignore[arg-type]
+    with pytest.raises(Trouble, match="an argument cannot be passed on"):
+        process.run("fields", None, None, path=Name.TEMP, ask=Ask())
+
+
+def test_python_that_does_not_start(tmp_path, monkeypatch):
+    write_mesh(tmp_path / "a.vtu", datasets.box((1, 1, 1)))
+    (tmp_path / "child.py").write_text("raise SystemExit(3)")
+    monkeypatch.setattr(process, "_CHILD", tmp_path / "child.py")
+    monkeypatch.setattr(process._pool, "idle", [])
+    with pytest.raises(OSError, match="Python could not be started to read files .exit code 3"):
+        read_mesh(tmp_path / "a.vtu")
+
+
+def test_the_end_of_much_output_is_kept():
+    code = (
+        f"import runpy, sys; child = runpy.run_path({process.child.__file__!r});"
+        "import os; out = os.dup(1); q = child['_Quiet']();"
+        "print('first' + 'x' * 100000 + 'last'); said = q.take();"
+        "os.write(out, (said[:5] + said.strip()[-4:] + str(len(said) < 50000)).encode())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert done.stdout == b"firstlastTrue"

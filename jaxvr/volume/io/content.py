@@ -75,7 +75,8 @@ class Content:
     """points (P, 3). cell, corner: from a name to one array for each of `parts`, (N, ...) or
     (N, corners, ...), None where a part lacks it. point_blocks: the blocks that have a point field,
     where not all do. active: the scalars that the file names. blocks: the names of all blocks.
-    steps: times of all steps, `step` the index of the one that was read; field_steps: (name,
+    steps: times of all steps where there are several, `step` the index of the one that was read;
+    field_steps: (name,
     location) to times, where fields have steps of their own. notes: what the caller is warned of.
     reordered: why the rows of parts are not those of the file, "" where they are.
     raw: points and cells that the reader found, before any are left out or cut.

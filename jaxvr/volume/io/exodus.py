@@ -84,8 +84,7 @@ def _content(data: Any, ask: Ask) -> Content:
         solid = is_solid(name)
         content.parts.append(Part(name, nodes if solid else len(nodes), label))
     content.blocks = tuple(labels)
-    if len(times) > 1:
-        content.steps, content.step = times, step
+    content.steps, content.step = times if len(times) > 1 else (), step
     if step is None:
         return content
     for i, name in enumerate(_names(data, "name_nod_var", 0)):

@@ -47,10 +47,6 @@ def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
     told = " ".join(said().split())
     if told:
         content.notes.append(f"meshio says: {told[:300]}")
-    if ask.step not in (None, 0, -1) and not content.steps:
-        raise Trouble("asked", f"There is no step {ask.step}: it has no time steps.")
-    if ask.block is not None:
-        raise Trouble("asked", "Its blocks have no names here, so none can be chosen.")
     return content
 
 
@@ -246,6 +242,5 @@ def _xdmf_series(path: Path, ask: Ask) -> Content | None:
         _, point, cell, *_ = reader.read_data(step)
     make: Any = meshio.Mesh
     content = content_of(make(points, cells, point_data=point, cell_data=cell))
-    if len(times) > 1:
-        content.steps, content.step = tuple(times), step
+    content.steps, content.step = tuple(times) if len(times) > 1 else (), step
     return content

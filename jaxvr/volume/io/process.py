@@ -95,8 +95,10 @@ def run(job: str, memory: int | None, seconds: float | None, **arguments: Any) -
                     break
                 raise EOFError
             except (EOFError, OSError):
-                if taken or fresh:
+                if taken:
                     raise _gone(process) from None
+                if fresh:
+                    raise _not_started(process) from None
             finally:
                 with pool.lock:
                     keep = whole and len(pool.idle) < KEPT
@@ -107,6 +109,14 @@ def run(job: str, memory: int | None, seconds: float | None, **arguments: Any) -
     if answer[0] == "trouble":
         raise Trouble(*answer[1:])
     return answer[1]
+
+
+def _not_started(process: subprocess.Popen[bytes]) -> Trouble:
+    try:
+        code = f" (exit code {process.wait(timeout=10)})"
+    except subprocess.TimeoutExpired:
+        code = ""
+    return Trouble("system", f"Python could not be started to read files{code}.")
 
 
 def _gone(process: subprocess.Popen[bytes]) -> Trouble:
