@@ -77,9 +77,10 @@ def _ask(step: Any, block: Any, limit: int | None) -> Ask:
     elif block is not None:
         many = [block] if isinstance(block, int | np.integer | np.bool_) else block
         try:
-            if any(isinstance(b, bool | np.bool_) for b in many):
+            items: list[Any] = list(many)
+            if any(isinstance(b, bool | np.bool_) for b in items):
                 raise TypeError
-            block = [str.__str__(b) if isinstance(b, str) else operator.index(b) for b in many]
+            block = [str.__str__(b) if isinstance(b, str) else operator.index(b) for b in items]
         except (TypeError, ValueError):
             raise ValueError(
                 f"block must be a name, an index or a list of them, but is {block!r}."

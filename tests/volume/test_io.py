@@ -526,3 +526,15 @@ def test_the_end_of_much_output_is_kept():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert done.stdout == b"firstlastTrue"
+
+
+def test_gmsh_entities_in_several_groups(tmp_path):
+    (tmp_path / "a.msh").write_text(
+        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n"
+        '$PhysicalNames\n2\n3 1 "one"\n3 2 "two"\n$EndPhysicalNames\n'
+        "$Entities\n0 0 0 1\n1 0 0 0 1 1 1 2 1 2 0\n$EndEntities\n"
+        "$Nodes\n1 4 1 4\n3 1 0 4\n1\n2\n3\n4\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n$EndNodes\n"
+        "$Elements\n1 1 1 1\n3 1 4 1\n1 1 2 3 4\n$EndElements\n"
+    )
+    for block in ("one", "two"):
+        assert read_mesh(tmp_path / "a.msh", block=block, values=np.zeros(4)).n_tets == 1

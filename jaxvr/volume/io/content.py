@@ -61,6 +61,7 @@ class Part:
     type: str
     nodes: np.ndarray | int
     block: str = ""
+    also: tuple[str, ...] = ()  # other blocks that they are in
 
     def __len__(self) -> int:
         return self.nodes if isinstance(self.nodes, int) else len(self.nodes)
@@ -161,7 +162,7 @@ def require_blocks(content: Content, asked: Any) -> Content:
     if asked is None:
         return content
     kept = {content.blocks[k] for k in pick_blocks(content.blocks, asked)}
-    places = [i for i, part in enumerate(content.parts) if part.block in kept]
+    places = [i for i, part in enumerate(content.parts) if kept & {part.block, *part.also}]
 
     def chosen(data: dict[str, list[Any]]) -> dict[str, list[Any]]:
         return {name: [a[i] for i in places] for name, a in data.items()}

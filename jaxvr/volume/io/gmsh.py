@@ -43,6 +43,8 @@ class _File:
     )
     names: dict[tuple[int, int], str] = dataclasses.field(default_factory=dict)
     physical: dict[tuple[int, int], list[int]] = dataclasses.field(default_factory=dict)
+    # physical groups beside the first, by place in `elements`
+    others: dict[int, list[int]] = dataclasses.field(default_factory=dict)
     regrouped: bool = False  # elements stand in another order than in the file
     data: dict[str, list[_Data]] = dataclasses.field(
         default_factory=lambda: {"NodeData": [], "ElementData": [], "ElementNodeData": []}
@@ -199,7 +201,10 @@ def _elements(file: _File, name: str, body: bytes) -> None:
         count = n * (width + 1)
         rows = (s.sizes(count) if new else s.ints(count)).reshape(n, width + 1)
         groups = file.physical.get((int(dim), int(tag)), [])
-        file.elements.append((int(kind), groups[0] if groups else 0, rows[:, 0], rows[:, 1:]))
+        tag = groups[0] if groups else 0
+        if dim == 3 and len(groups) > 1:
+            file.others[len(file.elements)] = groups[1:]
+        file.elements.append((int(kind), tag, rows[:, 0], rows[:, 1:]))
         total += n
     if total != head[1]:
         raise Trouble("damaged", f"$Elements counts {head[1]} elements, and {total} are there")
@@ -352,13 +357,15 @@ def _content(file: _File, ask: Ask) -> Content:
     if file.regrouped:
         content.reordered = "elements of physical groups or types take turns in it"
     element_ids, solid_blocks = [], {}
-    for number, tag, own, nodes in file.elements:
+    for k, (number, tag, own, nodes) in enumerate(file.elements):
         kind, _ = TYPES[number]
         element_ids.append(own)
         if is_solid(kind):
             block = file.names.get((3, tag), str(tag)) if tag else "no group"
             solid_blocks[block] = None
-            content.parts.append(Part(kind, place(nodes, f"a {kind}"), block))
+            also = tuple(file.names.get((3, t), str(t)) for t in file.others.get(k, ()))
+            solid_blocks.update(dict.fromkeys(also))
+            content.parts.append(Part(kind, place(nodes, f"a {kind}"), block, also))
         else:
             content.parts.append(Part(kind, len(nodes)))
     content.blocks = tuple(solid_blocks)
