@@ -1,6 +1,7 @@
 """Kinds of files, and what goes wrong with them: nothing is left out in silence."""
 
 import enum
+import os
 import subprocess
 import sys
 import threading
@@ -538,3 +539,15 @@ def test_gmsh_entities_in_several_groups(tmp_path):
     )
     for block in ("one", "two"):
         assert read_mesh(tmp_path / "a.msh", block=block, values=np.zeros(4)).n_tets == 1
+
+
+def test_a_forked_process_closes_what_it_got(tmp_path, monkeypatch):
+    write_mesh(tmp_path / "a.vtu", datasets.box((1, 1, 1)))
+    pool = process._Pool()
+    monkeypatch.setattr(process, "_pool", pool)
+    read_mesh(tmp_path / "a.vtu")
+    (worker,) = pool.idle
+    process._forked()
+    assert process._pool is not pool and worker.stdin.closed and worker.stdout.closed
+    os.waitpid(worker.pid, 0)  # it ends with its input
+    assert worker.returncode == 0

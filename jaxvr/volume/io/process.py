@@ -68,6 +68,21 @@ def _end_all() -> None:
             _end(_pool.idle.pop())
 
 
+def _forked() -> None:
+    """In a forked process: the pipes and processes are the other's. Nothing is flushed there."""
+    global _pool
+    idle, _pool = _pool.idle, _Pool()
+    for process in idle:
+        for stream in (process.stdin, process.stdout):
+            if stream is not None:
+                stream.close()
+        process.returncode = 0  # not to be waited for here
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)
+
+
 def run(job: str, memory: int | None, seconds: float | None, **arguments: Any) -> Any:
     """What the function `job` of `jobs` returns for these arguments. Raises Trouble.
 
