@@ -163,7 +163,12 @@ def _mesh(arguments: Any) -> TetMesh:
         return read_plot3d(arguments.file, arguments.q, field=arguments.field)
     step = arguments.step
     if step is not None:
-        step = int(step) if step.lstrip("-").isdecimal() else float(step)
+        try:
+            step = int(step) if step.lstrip("-").isdecimal() else float(step)
+        except ValueError:
+            raise ValueError(
+                f"--step must be an index (3) or a time with a point (0.5), but is {step!r}."
+            ) from None
     return read_mesh(arguments.file, field=arguments.field, step=step, block=arguments.block)
 
 

@@ -9,6 +9,7 @@ asked for by component, and what is taken where there is a choice is told.
 from __future__ import annotations
 
 import dataclasses
+import operator
 import os
 import shutil
 import uuid
@@ -71,10 +72,15 @@ def _ask(step: Any, block: Any, limit: int | None) -> Ask:
         )
     if isinstance(step, np.integer | np.floating):
         step = step.item()
-    if block is not None and not isinstance(block, str):
-        many = [block] if isinstance(block, int | np.integer) else block
+    if isinstance(block, str):
+        block = str.__str__(block)  # of subclasses, which the reading process does not know
+    elif block is not None:
+        many = [block] if isinstance(block, int | np.integer | np.bool_) else block
         try:
-            block = [b if isinstance(b, str) else int(b) for b in many]
+            items: list[Any] = list(many)
+            if any(isinstance(b, bool | np.bool_) for b in items):
+                raise TypeError
+            block = [str.__str__(b) if isinstance(b, str) else operator.index(b) for b in items]
         except (TypeError, ValueError):
             raise ValueError(
                 f"block must be a name, an index or a list of them, but is {block!r}."
@@ -207,6 +213,11 @@ def read_mesh(
         raise ValueError(
             f'location must be "point", "cell", "corner" or None, but is {location!r}.'
         )
+    if field is not None:
+        if not isinstance(field, str):
+            raise ValueError(f"field must be a name, but is {type(field).__name__}.")
+        field = str.__str__(field)
+    location = None if location is None else str.__str__(location)
     if values is not None and field is not None:
         raise ValueError("Pass a field of the file or values, not both.")
     file = _existing(path)
@@ -219,7 +230,10 @@ def read_mesh(
     cells = {t: range(c) if isinstance(c, int) else c for t, c in got["cells"].items()}
     try:
         if values is not None:
-            values = values(got["points"]) if isinstance(values, Callable) else values
+            if isinstance(values, Callable):
+                values = values(got["points"])
+            else:
+                _require_order(values, location, len(got["points"]), got["reordered"])
         else:
             values, location = got["values"], got["location"]
         return _from_cells(
@@ -231,6 +245,18 @@ def read_mesh(
         if file.name not in message:
             message = f"{file.name}: {message}"
         raise ValueError(message) from e
+
+
+def _require_order(values: Any, location: str | None, n_points: int, why: str) -> None:
+    """ValueError for one array of cells where the cells of the file come in another order."""
+    if not why or isinstance(values, dict) or location == "point":
+        return
+    if location is None and len(np.shape(values)) == 1 and len(values) == n_points:
+        return
+    raise ValueError(
+        f"values cannot be one array for the cells of this file, whose order is not kept: {why}. "
+        "Pass values at its points, a function of the points, or a dict by type of cell."
+    )
 
 
 def write_mesh(path: Any, mesh: TetMesh) -> None:

@@ -1,5 +1,8 @@
 """Kinds of files, and what goes wrong with them: nothing is left out in silence."""
 
+import enum
+import os
+import subprocess
 import sys
 import threading
 import warnings
@@ -10,8 +13,8 @@ import pytest
 
 from experiments import file_kinds, file_makers
 from jaxvr.volume import Field, TetMesh, datasets, list_fields, read_mesh, write_mesh
-from jaxvr.volume.io import process, registry, sizes
-from jaxvr.volume.io.content import Ask, Trouble
+from jaxvr.volume.io import exodus, fields, meshio_files, process, registry, sizes
+from jaxvr.volume.io.content import Ask, Content, Part, Trouble, join
 
 # What packages that are not among those of the tests write.
 ELSEWHERE = ("gmsh", "netCDF4")
@@ -291,21 +294,15 @@ def test_a_reader_that_crashes(tmp_path, monkeypatch):
     """What it does to its process does not reach this one; the next file is read."""
     path = tmp_path / "a.vtu"
     write_mesh(path, datasets.box((1, 1, 1)))
-    given = process.child.receive
-
-    def killed(stream):
-        for worker in working:
-            worker.kill()
-        return given(stream)
-
-    working = []
-    start = process._start
-    monkeypatch.setattr(process, "_start", lambda: working.append(start()) or working[-1])
+    crashing = tmp_path / "child.py"  # takes the request, and is killed
+    crashing.write_text(
+        "import os, sys\nsys.stdin.buffer.read(1)\nos.write(1, b'!')\nos.kill(os.getpid(), 9)\n"
+    )
+    monkeypatch.setattr(process, "_CHILD", crashing)
     monkeypatch.setattr(process._pool, "idle", [])
-    monkeypatch.setattr(process.child, "receive", killed)
     with pytest.raises(ValueError, match="takes more memory"):  # as the system ends those that do
         read_mesh(path)
-    assert [w.poll() for w in working] == [-9]
+    assert process._pool.idle == []
     monkeypatch.undo()
     assert read_mesh(path).n_tets == 6
 
@@ -400,3 +397,157 @@ def test_repairs_of_more_than_a_tenth(part, tmp_path):
             assert volume(read_mesh(tmp_path / "a.vtu", "t")) == pytest.approx(
                 125 * 1.002, rel=1e-6
             )
+
+
+def test_cell_values_where_types_take_turns(tmp_path):
+    points, hexes = file_makers.lattice(2)
+    import pyvista as pv
+
+    a, b, c = hexes[0][[0, 1, 3, 4]], hexes[1], hexes[3][[0, 1, 3, 4]]
+    cells = np.concatenate([[4], a, [8], b, [4], c])
+    grid = pv.UnstructuredGrid(cells, np.array([10, 12, 10], np.uint8), points)
+    grid.save(str(tmp_path / "a.vtu"))
+    with pytest.raises(ValueError, match="types of cells take turns.*dict by type"):
+        read_mesh(tmp_path / "a.vtu", values=[10.0, 20.0, 30.0])
+    mesh = quietly(tmp_path / "a.vtu", values={"tetra": [10.0, 30.0], "hexahedron": [20.0]})
+    assert sorted(set(np.asarray(mesh.values).tolist())) == [10.0, 20.0, 30.0]
+
+
+def test_cell_values_where_groups_take_turns(msh):
+    lines = msh.read_text().replace(
+        "3 4 2 7 1 10 30 20 50", "3 4 2 7 1 10 30 20 50\n4 4 2 8 1 10 20 30 50"
+    )
+    msh.write_text(lines.replace("$Elements\n3\n", "$Elements\n4\n"))
+    with pytest.raises(ValueError, match="physical groups.*take turns"):
+        read_mesh(msh, values=[1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.su2", "NZONE= 2\nIZONE= 1\nNDIME= 3\n", "2 zones"),
+        ("a.inp", "*PART, NAME=A\n*END PART\n*Part, name=B\n*END PART\n", "2 parts"),
+        ("a.inp", "*INSTANCE, NAME=A, PART=A\n*END INSTANCE\n" * 2, "2 instances"),
+        ("a.inp", "*Instance, name=A, part=A\n 0., 0., 5.\n*End Instance\n", "is moved"),
+        ("a.bdf", "BEGIN BULK\nGRID           1       5     0.0     0.0     0.0\n", "system 5"),
+        ("a.bdf", "BEGIN BULK\nGRID,1,2,0.,0.,0.\n", "system 2"),
+        ("a.bdf", "BEGIN BULK\nGRDSET,,7\n", "system 7"),
+    ],
+)
+def test_files_of_which_a_part_would_be_read_or_misplaced(name, text, words, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=f"kind that is not supported: .*{words}"):
+        read_mesh(tmp_path / name)
+
+
+def test_all_zones_of_a_tecplot_file(tmp_path):
+    zone = "ZONE N=4, E=1, F=FEPOINT, ET=TETRAHEDRON\n"
+    rows = [[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]]
+    text = 'VARIABLES = "X" "Y" "Z" "t"\n'
+    for k in range(2):
+        text += zone + "".join(f"{x + 3 * k} {y} {z} {t + k}\n" for x, y, z, t in rows)
+        text += "1 2 3 4\n"
+    (tmp_path / "a.dat").write_text(text)
+    assert quietly(tmp_path / "a.dat").n_tets == 2
+    with pytest.raises(Trouble, match="2 zones"):
+        meshio_files.read(tmp_path / "a.dat", Ask(), str, ".dat")
+
+
+def test_blocks_whose_field_has_other_components():
+    def block(data):
+        nodes = np.arange(4)[None]
+        return Content(np.eye(4, 3), [Part("tetra", nodes)], cell={"a": [data]})
+
+    both = join([block(np.ones(1)), block(np.ones((1, 3)))], ["one", "two"])
+    with pytest.raises(Trouble, match="1 in 'two' have no value"):
+        fields.arrays_of(both, "f", "a", None)
+    assert "other numbers of components" in both.notes[0]
+
+
+def test_exodus_scalar_with_the_name_of_a_stem():
+    names = ("vel", "velx", "vely", "velz", "u_x", "u_y", "u_z")
+    content = Content(np.eye(4, 3), [], point={n: np.full(4, k) for k, n in enumerate(names)})
+    exodus._vectors(content)
+    assert sorted(content.point) == ["u", "vel", "velx", "vely", "velz"]
+    assert content.point["vel"].tolist() == [0] * 4
+
+
+def test_steps_and_blocks_of_files_without(tmp_path, msh):
+    write_mesh(tmp_path / "a.vtu", datasets.box((1, 1, 1)))
+    (tmp_path / "a.pvd").write_text(
+        '<VTKFile type="Collection"><Collection><DataSet timestep="0.5" file="a.vtu"/>'
+        "</Collection></VTKFile>"
+    )
+    msh.write_text(CORNER + STEP.format(t=0.5, k=0, v=1))
+    image = BY_NAME["VTI"].make(tmp_path).path
+    for path in (tmp_path / "a.vtu", image, tmp_path / "a.pvd", msh):
+        with pytest.raises(ValueError, match="There is no step 7: it has"):
+            read_mesh(path, step=7)
+        with pytest.raises(ValueError, match="There is no block 'x'"):
+            read_mesh(path, block="x")
+        assert read_mesh(path, step=0).n_tets
+    assert read_mesh(tmp_path / "a.pvd", step=0.5).n_tets == 6
+    assert quietly(msh, "temp", step=0.5).n_tets == 2
+    for bad in (True, [0.9], [True], 0.5, np.True_):
+        with pytest.raises(ValueError, match="block must be a name, an index"):
+            read_mesh(msh, block=bad)
+
+
+class Name(enum.StrEnum):
+    TEMP = "temp"
+    LOWER = "lower part"
+    POINT = "point"
+
+
+def test_names_of_the_callers_classes(msh):
+    mesh = quietly(msh, Name.TEMP, location=Name.POINT, block=Name.LOWER)
+    assert mesh.report.field == "temp" and mesh.n_tets == 1
+    assert quietly(msh, Name.TEMP, block=[Name.LOWER]).n_tets == 1
+    with pytest.raises(ValueError, match="field must be a name, but is int"):
+        read_mesh(msh, 3)  # type: ignore[arg-type]
+    with pytest.raises(Trouble, match="an argument cannot be passed on"):
+        process.run("fields", None, None, path=Name.TEMP, ask=Ask())
+
+
+def test_python_that_does_not_start(tmp_path, monkeypatch):
+    write_mesh(tmp_path / "a.vtu", datasets.box((1, 1, 1)))
+    (tmp_path / "child.py").write_text("raise SystemExit(3)")
+    monkeypatch.setattr(process, "_CHILD", tmp_path / "child.py")
+    monkeypatch.setattr(process._pool, "idle", [])
+    with pytest.raises(OSError, match="Python could not be started to read files .exit code 3"):
+        read_mesh(tmp_path / "a.vtu")
+
+
+def test_the_end_of_much_output_is_kept():
+    code = (
+        f"import runpy, sys; child = runpy.run_path({process.child.__file__!r});"
+        "import os; out = os.dup(1); q = child['_Quiet']();"
+        "print('first' + 'x' * 100000 + 'last'); said = q.take();"
+        "os.write(out, (said[:5] + said.strip()[-4:] + str(len(said) < 50000)).encode())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert done.stdout == b"firstlastTrue"
+
+
+def test_gmsh_entities_in_several_groups(tmp_path):
+    (tmp_path / "a.msh").write_text(
+        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n"
+        '$PhysicalNames\n2\n3 1 "one"\n3 2 "two"\n$EndPhysicalNames\n'
+        "$Entities\n0 0 0 1\n1 0 0 0 1 1 1 2 1 2 0\n$EndEntities\n"
+        "$Nodes\n1 4 1 4\n3 1 0 4\n1\n2\n3\n4\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n$EndNodes\n"
+        "$Elements\n1 1 1 1\n3 1 4 1\n1 1 2 3 4\n$EndElements\n"
+    )
+    for block in ("one", "two"):
+        assert read_mesh(tmp_path / "a.msh", block=block, values=np.zeros(4)).n_tets == 1
+
+
+def test_a_forked_process_closes_what_it_got(tmp_path, monkeypatch):
+    write_mesh(tmp_path / "a.vtu", datasets.box((1, 1, 1)))
+    pool = process._Pool()
+    monkeypatch.setattr(process, "_pool", pool)
+    read_mesh(tmp_path / "a.vtu")
+    (worker,) = pool.idle
+    process._forked()
+    assert process._pool is not pool and worker.stdin.closed and worker.stdout.closed
+    os.waitpid(worker.pid, 0)  # it ends with its input
+    assert worker.returncode == 0

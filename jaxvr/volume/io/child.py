@@ -20,7 +20,7 @@ from typing import IO, Any
 
 TAKEN = b"!"
 IDLE_S = 120  # then the process ends by itself
-SAID = 20_000  # characters of what readers print that are kept
+SAID = 20_000  # bytes of what readers print that are kept, of the beginning and of the end
 
 
 def send(stream: IO[bytes], what: Any) -> None:
@@ -82,8 +82,13 @@ class _Quiet:
     def take(self) -> str:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
+        size = os.lseek(self.fd, 0, os.SEEK_END)
         os.lseek(self.fd, 0, os.SEEK_SET)
-        said = os.read(self.fd, SAID).decode("utf-8", "replace")
+        raw = os.read(self.fd, SAID)
+        if size > len(raw):  # what is wrong is often said last
+            os.lseek(self.fd, max(len(raw), size - SAID), os.SEEK_SET)
+            raw += b"\n[...]\n" + os.read(self.fd, SAID)
+        said = raw.decode("utf-8", "replace")
         os.lseek(self.fd, 0, os.SEEK_SET)
         os.ftruncate(self.fd, 0)
         return said
@@ -146,15 +151,22 @@ def main() -> None:
 
     threading.Thread(target=watch, daemon=True).start()
     while True:
+        failed = ""
         try:
             name, arguments, settings = receive(stdin)
         except EOFError:
             os._exit(0)
+        except Exception as e:  # of classes that are not known here
+            name, arguments, settings = "", {}, {"path": sys.path}
+            failed = f"an argument cannot be passed on to where files are read: {e!r}"
         state["busy"] = True
         stdout.write(TAKEN)
         stdout.flush()
         sys.path[:] = settings["path"]
-        answer = _answer(name, arguments, settings, said)
+        if failed:
+            answer = "trouble", "asked", failed
+        else:
+            answer = _answer(name, arguments, settings, said)
         try:
             send(stdout, answer)
         except (BrokenPipeError, OSError):

@@ -61,6 +61,7 @@ class Part:
     type: str
     nodes: np.ndarray | int
     block: str = ""
+    also: tuple[str, ...] = ()  # other blocks that they are in
 
     def __len__(self) -> int:
         return self.nodes if isinstance(self.nodes, int) else len(self.nodes)
@@ -75,8 +76,10 @@ class Content:
     """points (P, 3). cell, corner: from a name to one array for each of `parts`, (N, ...) or
     (N, corners, ...), None where a part lacks it. point_blocks: the blocks that have a point field,
     where not all do. active: the scalars that the file names. blocks: the names of all blocks.
-    steps: times of all steps, `step` the index of the one that was read; field_steps: (name,
+    steps: times of all steps where there are several, `step` the index of the one that was read;
+    field_steps: (name,
     location) to times, where fields have steps of their own. notes: what the caller is warned of.
+    reordered: why the rows of parts are not those of the file, "" where they are.
     raw: points and cells that the reader found, before any are left out or cut.
     """
 
@@ -93,6 +96,7 @@ class Content:
     field_steps: dict[tuple[str, str], tuple[float, ...]] = dataclasses.field(default_factory=dict)
     notes: list[str] = dataclasses.field(default_factory=list)
     reader: str = ""
+    reordered: str = ""
     raw: tuple[int, int] | None = None
 
     @property
@@ -158,7 +162,7 @@ def require_blocks(content: Content, asked: Any) -> Content:
     if asked is None:
         return content
     kept = {content.blocks[k] for k in pick_blocks(content.blocks, asked)}
-    places = [i for i, part in enumerate(content.parts) if part.block in kept]
+    places = [i for i, part in enumerate(content.parts) if kept & {part.block, *part.also}]
 
     def chosen(data: dict[str, list[Any]]) -> dict[str, list[Any]]:
         return {name: [a[i] for i in places] for name, a in data.items()}
@@ -207,12 +211,25 @@ def join(contents: list[Content], names: list[str]) -> Content:
         points.append(content.points)
         start += n
 
+    notes = list(dict.fromkeys(n for c in contents for n in c.notes))
+
     def rows(what: str) -> dict[str, list[np.ndarray | None]]:
         found: dict[str, list[np.ndarray | None]] = {}
         for key in dict.fromkeys(k for c in contents for k in getattr(c, what)):
             column = found.setdefault(key, [])
             for c in contents:
                 column += getattr(c, what).get(key, [None] * len(c.parts))
+            lead = 1 if what == "cell" else 2
+            shapes = [None if a is None else a.shape[lead:] for a in column]
+            first = next((s for s in shapes if s is not None), None)
+            if any(s not in (None, first) for s in shapes):
+                notes.append(
+                    f"Field {key!r} has other numbers of components in some blocks than in the "
+                    "first, and counts as absent there: pass block= to read them."
+                )
+                found[key] = [
+                    a if s == first else None for a, s in zip(column, shapes, strict=True)
+                ]
         return found
 
     return Content(
@@ -224,6 +241,7 @@ def join(contents: list[Content], names: list[str]) -> Content:
         point_blocks={k: tuple(w) for k, w in where.items() if len(w) < len(filled)},
         active=contents[0].active,
         blocks=tuple(names),
-        notes=list(dict.fromkeys(n for c in contents for n in c.notes)),
+        notes=notes,
         reader=contents[0].reader,
+        reordered=next((c.reordered for c in contents if c.reordered), ""),
     )

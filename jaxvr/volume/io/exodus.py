@@ -84,8 +84,7 @@ def _content(data: Any, ask: Ask) -> Content:
         solid = is_solid(name)
         content.parts.append(Part(name, nodes if solid else len(nodes), label))
     content.blocks = tuple(labels)
-    if len(times) > 1:
-        content.steps, content.step = times, step
+    content.steps, content.step = times if len(times) > 1 else (), step
     if step is None:
         return content
     for i, name in enumerate(_names(data, "name_nod_var", 0)):
@@ -107,7 +106,11 @@ def _vectors(content: Content) -> None:
         for name in [n for n in group if n.lower().endswith("x")]:
             stem = name[:-1]
             rest = [stem + a for a in ("yz" if name[-1] == "x" else "YZ")]
-            if stem.rstrip("_ ") and all(r in group for r in rest):
+            if (
+                stem.rstrip("_ ")
+                and stem.rstrip("_ ") not in group
+                and all(r in group for r in rest)
+            ):
                 parts: list[Any] = [group.pop(n) for n in (name, *rest)]
                 if group is content.point:
                     content.point[stem.rstrip("_ ")] = np.stack(parts, -1)

@@ -153,6 +153,7 @@ def arrays_of(
         "values": None,
         "location": None,
         "label": None,
+        "reordered": content.reordered or _interleaved(content),
     }
     if not want:
         return out
@@ -179,6 +180,13 @@ def arrays_of(
         }
         return out
     return out | _corners(content, solid, arrays, component)
+
+
+def _interleaved(content: Content) -> str:
+    """Why cells by type are in another order than in the parts."""
+    types = [p.type for p in content.parts if p.solid and len(p)]
+    runs = [t for k, t in enumerate(types) if k == 0 or t != types[k - 1]]
+    return "types of cells take turns in it" if len(runs) > len(set(runs)) else ""
 
 
 def _require_everywhere(field: Field, lacking: list[int], content: Content) -> None:

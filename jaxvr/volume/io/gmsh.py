@@ -43,6 +43,9 @@ class _File:
     )
     names: dict[tuple[int, int], str] = dataclasses.field(default_factory=dict)
     physical: dict[tuple[int, int], list[int]] = dataclasses.field(default_factory=dict)
+    # physical groups beside the first, by place in `elements`
+    others: dict[int, list[int]] = dataclasses.field(default_factory=dict)
+    regrouped: bool = False  # elements stand in another order than in the file
     data: dict[str, list[_Data]] = dataclasses.field(
         default_factory=lambda: {"NodeData": [], "ElementData": [], "ElementNodeData": []}
     )
@@ -198,7 +201,10 @@ def _elements(file: _File, name: str, body: bytes) -> None:
         count = n * (width + 1)
         rows = (s.sizes(count) if new else s.ints(count)).reshape(n, width + 1)
         groups = file.physical.get((int(dim), int(tag)), [])
-        file.elements.append((int(kind), groups[0] if groups else 0, rows[:, 0], rows[:, 1:]))
+        tag = groups[0] if groups else 0
+        if dim == 3 and len(groups) > 1:
+            file.others[len(file.elements)] = groups[1:]
+        file.elements.append((int(kind), tag, rows[:, 0], rows[:, 1:]))
         total += n
     if total != head[1]:
         raise Trouble("damaged", f"$Elements counts {head[1]} elements, and {total} are there")
@@ -211,6 +217,7 @@ def _elements_2(file: _File, name: str, body: bytes) -> None:
     if n < 0 or n > s.left:
         raise Trouble("damaged", f"$Elements counts {n} elements in {len(rest)} bytes")
     groups: dict[tuple[int, int], list[np.ndarray]] = {}
+    sequence: list[tuple[int, int]] = []  # (type, physical group) of each run of elements
 
     def add(kind: int, rows: np.ndarray, tags: int) -> None:
         physical = rows[:, 1] if tags else np.zeros(len(rows), np.int64)
@@ -225,7 +232,11 @@ def _elements_2(file: _File, name: str, body: bytes) -> None:
             kind, m, tags = s.ints(3)
             if m < 1 or m > left or tags < 0:
                 raise Trouble("damaged", f"$Elements has a block of {m} where {left} are left")
-            add(int(kind), s.table(int(m), 1 + int(tags) + _type(kind)[1]), int(tags))
+            rows = s.table(int(m), 1 + int(tags) + _type(kind)[1])
+            for tag in rows[:, 1].tolist() if tags else [0]:
+                if sequence[-1:] != [(int(kind), tag)]:
+                    sequence.append((int(kind), tag))
+            add(int(kind), rows, int(tags))
             left -= int(m)
     else:
         lines: dict[tuple[int, int], list[list[int]]] = {}
@@ -240,6 +251,9 @@ def _elements_2(file: _File, name: str, body: bytes) -> None:
                     raise IndexError
             except (ValueError, IndexError):
                 raise Trouble("damaged", f"$Elements: {line[:60]!r} is no element") from None
+            key = (kind, row[3] if tags else 0)
+            if sequence[-1:] != [key]:
+                sequence.append(key)
             lines.setdefault((kind, tags), []).append(row[:1] + row[3:])
             left -= 1
         if left:
@@ -249,6 +263,10 @@ def _elements_2(file: _File, name: str, body: bytes) -> None:
                 add(kind, np.array(rows, np.int64), tags)
             except OverflowError as e:
                 raise Trouble("damaged", f"$Elements: {e}") from None
+    solid = {k: is_solid(_type(k)[0]) for k, _ in sequence}
+    found = [key for key in sequence if solid[key[0]]]
+    if found != [key for key in groups if solid[key[0]]]:
+        file.regrouped = True
     for (kind, tag), parts in groups.items():
         rows = np.concatenate(parts)
         file.elements.append((kind, tag, rows[:, 0], rows[:, 1:]))
@@ -336,14 +354,18 @@ def _content(file: _File, ask: Ask) -> Content:
         return order[at]
 
     content = Content(points=file.points, parts=[])
+    if file.regrouped:
+        content.reordered = "elements of physical groups or types take turns in it"
     element_ids, solid_blocks = [], {}
-    for number, tag, own, nodes in file.elements:
+    for k, (number, tag, own, nodes) in enumerate(file.elements):
         kind, _ = TYPES[number]
         element_ids.append(own)
         if is_solid(kind):
             block = file.names.get((3, tag), str(tag)) if tag else "no group"
             solid_blocks[block] = None
-            content.parts.append(Part(kind, place(nodes, f"a {kind}"), block))
+            also = tuple(file.names.get((3, t), str(t)) for t in file.others.get(k, ()))
+            solid_blocks.update(dict.fromkeys(also))
+            content.parts.append(Part(kind, place(nodes, f"a {kind}"), block, also))
         else:
             content.parts.append(Part(kind, len(nodes)))
     content.blocks = tuple(solid_blocks)

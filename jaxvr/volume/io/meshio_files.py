@@ -47,10 +47,6 @@ def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
     told = " ".join(said().split())
     if told:
         content.notes.append(f"meshio says: {told[:300]}")
-    if ask.step not in (None, 0, -1) and not content.steps:
-        raise Trouble("asked", f"There is no step {ask.step}: it has no time steps.")
-    if ask.block is not None:
-        raise Trouble("asked", "Its blocks have no names here, so none can be chosen.")
     return content
 
 
@@ -58,6 +54,7 @@ def _patched(meshio: Any, path: Path, file_format: str) -> Any:
     """meshio's mesh, of a file as its reader wants it: see the comments."""
     import io
 
+    _require_flat(path, file_format)
     if file_format == "nastran":
         text = path.read_bytes()
         if b"BEGIN BULK" not in text.upper():  # optional in bulk data files, as gmsh writes them
@@ -75,6 +72,40 @@ def _patched(meshio: Any, path: Path, file_format: str) -> Any:
     if file_format == "med":
         _without_groups(meshio.med._med)
     return meshio.read(path, file_format)
+
+
+def _require_flat(path: Path, file_format: str) -> None:
+    """Trouble for files of which meshio would read a part, or put nodes in wrong places."""
+
+    def lines(pattern: str) -> list[str]:
+        text = path.read_text("utf-8", "replace")
+        return [m[0].rstrip() for m in re.finditer(pattern, text, re.M | re.I)]
+
+    why = ""
+    if file_format == "tecplot" and (n := len(lines(r"^[ \t]*ZONE\b.*"))) > 1:
+        why = f"it has {n} zones, of which meshio reads one"
+    elif file_format == "su2":
+        zones = [w.partition("=")[2].strip() for w in lines(r"^[ \t]*NZONE[ \t]*=[ \t]*\d+")]
+        if any(int(n) > 1 for n in zones):
+            why = f"it has {zones[0]} zones, of which one would be read"
+    elif file_format == "abaqus":
+        n = len(lines(r"^\*INSTANCE\b.*"))
+        moved = lines(r"^\*INSTANCE\b.*\n(?:\*\*.*\n)*[ \t]*[-+.\d].*")
+        if (parts := len(lines(r"^\*PART\b.*"))) > 1 or n > 1:
+            why = f"it is an assembly of {parts} parts and {n} instances; save one flat mesh"
+        elif moved:
+            why = "its instance of a part is moved; save one flat mesh"
+    elif file_format == "nastran":
+        for line in lines(r"^(?:GRID|GRDSET)\*?[ ,\t].*"):
+            if "," in line:
+                system = [*line.split(","), "", "", ""][2]
+            else:
+                system = line[24:40] if line[:8].strip().endswith("*") else line[16:24]
+            if system.strip() not in ("", "0"):
+                why = f"coordinates of {line[:24]!r} are in system {system.strip()}, not the basic"
+                break
+    if why:
+        raise Trouble("unsupported", why)
 
 
 def _without_groups(module: Any) -> None:
@@ -128,6 +159,7 @@ def content_of(mesh: Any) -> Content:
         if block.type.startswith("polyhedron"):
             faces = [[[int(i) for i in f] for f in cell] for cell in block.data]
             tets, parent = polyhedra.cut(content, faces, np.arange(start, start + n))
+            content.reordered = "polyhedra are cut"
             content.parts.append(Part("polyhedron parts", tets))
             rows.append(parent)
         elif is_solid(block.type):
@@ -173,6 +205,7 @@ def _without_ghosts(content: Content) -> None:
         if hidden is not None:
             drawn &= (hidden.astype(int) & NOT_DRAWN["point"] == 0)[part.nodes].all(1)
         if not drawn.all():
+            content.reordered = "ghost cells are left out"
             part.nodes = part.nodes[drawn]
             for arrays in content.cell.values():
                 a = arrays[k]
@@ -209,6 +242,5 @@ def _xdmf_series(path: Path, ask: Ask) -> Content | None:
         _, point, cell, *_ = reader.read_data(step)
     make: Any = meshio.Mesh
     content = content_of(make(points, cells, point_data=point, cell_data=cell))
-    if len(times) > 1:
-        content.steps, content.step = tuple(times), step
+    content.steps, content.step = tuple(times) if len(times) > 1 else (), step
     return content

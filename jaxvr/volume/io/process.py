@@ -68,6 +68,21 @@ def _end_all() -> None:
             _end(_pool.idle.pop())
 
 
+def _forked() -> None:
+    """In a forked process: the pipes and processes are the other's. Nothing is flushed there."""
+    global _pool
+    idle, _pool = _pool.idle, _Pool()
+    for process in idle:
+        for stream in (process.stdin, process.stdout):
+            if stream is not None:
+                stream.close()
+        process.returncode = 0  # not to be waited for here
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)
+
+
 def run(job: str, memory: int | None, seconds: float | None, **arguments: Any) -> Any:
     """What the function `job` of `jobs` returns for these arguments. Raises Trouble.
 
@@ -95,8 +110,10 @@ def run(job: str, memory: int | None, seconds: float | None, **arguments: Any) -
                     break
                 raise EOFError
             except (EOFError, OSError):
-                if taken or fresh:
+                if taken:
                     raise _gone(process) from None
+                if fresh:
+                    raise _not_started(process) from None
             finally:
                 with pool.lock:
                     keep = whole and len(pool.idle) < KEPT
@@ -107,6 +124,14 @@ def run(job: str, memory: int | None, seconds: float | None, **arguments: Any) -
     if answer[0] == "trouble":
         raise Trouble(*answer[1:])
     return answer[1]
+
+
+def _not_started(process: subprocess.Popen[bytes]) -> Trouble:
+    try:
+        code = f" (exit code {process.wait(timeout=10)})"
+    except subprocess.TimeoutExpired:
+        code = ""
+    return Trouble("system", f"Python could not be started to read files{code}.")
 
 
 def _gone(process: subprocess.Popen[bytes]) -> Trouble:

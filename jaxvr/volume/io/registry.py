@@ -107,6 +107,19 @@ def _is_gmsh(path: Path) -> bool:
 
 def read(path: Path, ask: Ask, said: Callable[[], str]) -> Content:
     """The content of a file. Raises Trouble."""
+    content = _read(path, ask, said)
+    if ask.block is not None and not content.blocks:
+        raise Trouble("asked", f"There is no block {ask.block!r}: it has no blocks with names")
+    if ask.step is not None and content.step is None:
+        times = sorted({t for each in content.field_steps.values() for t in each})
+        several = any(len(each) > 1 for each in content.field_steps.values())  # chosen by field
+        if not several and ask.step not in (0, -1, *times):
+            has = f"one step, at {times[0]:g}" if times else "no time steps"
+            raise Trouble("asked", f"There is no step {ask.step}: it has {has}")
+    return content
+
+
+def _read(path: Path, ask: Ask, said: Callable[[], str]) -> Content:
     suffix = suffix_of(path)
     if suffix in (".pvd", ".series"):
         return _series(path, ask, said, suffix)
@@ -193,6 +206,7 @@ def _series(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Conte
         content = join([read(here[k][1], inner, said) for k in chosen], [names[k] for k in chosen])
         content.blocks = names
     content.raw = None
+    content.step = step
     if len(times) > 1:
-        content.steps, content.step = times, step
+        content.steps = times
     return content

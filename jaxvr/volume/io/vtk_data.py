@@ -193,6 +193,12 @@ def _parts(content: Content, grid: Any, point_ghosts: Any, cell_ghosts: Any) -> 
     if len(sizes) != len(kinds) or (sizes < 0).any() or offsets[-1:].sum() > len(nodes):
         raise Trouble("malformed", "The offsets of its cells do not fit their number.")
     drawn = _drawn(kinds, sizes, nodes, point_ghosts, cell_ghosts)
+    if not drawn.all():
+        content.reordered = "ghost cells are left out"
+    elif np.isin(kinds, _CUT).any():
+        content.reordered = "polyhedra are cut"
+    elif _interleave(kinds):
+        content.reordered = "types of cells take turns in it"
     numbers, first = np.unique(kinds, return_index=True)
     for number in numbers[np.argsort(first)].tolist():
         these = np.flatnonzero((kinds == number) & drawn)
@@ -215,6 +221,13 @@ def _parts(content: Content, grid: Any, point_ghosts: Any, cell_ghosts: Any) -> 
             content.parts.append(Part(name, nodes[columns].astype(np.int64)))
             rows.append(these)
     return rows
+
+
+def _interleave(kinds: np.ndarray) -> bool:
+    """Whether solids of one type stand in several places, with others between them."""
+    solid = [k for k in np.unique(kinds) if is_solid(NAMES.get(int(k), f"VTK {k}"))]
+    only = kinds[np.isin(kinds, solid)]
+    return int((only[1:] != only[:-1]).sum()) + 1 > max(len(solid), 1)
 
 
 def _require_size(name: str, sizes: np.ndarray, these: np.ndarray) -> None:

@@ -98,7 +98,7 @@ def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
     content = content_of(data, ask.block, ask.limit, path.name)
     content.reader = name
     content.steps = steps if len(steps) > 1 else ()
-    content.step = step if len(steps) > 1 else None
+    content.step = step
     if suffix == ".vtk":
         content.active = []  # that is the last of those that were read
     if told:
