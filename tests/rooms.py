@@ -53,6 +53,7 @@ CHOSEN: dict[str, tuple[str, ...]] = {
         "test_bad_arguments",
     ),
     "test_testing.py": ("test_nasty_rays", "nasty_meshes[one]", "test_differences_know"),
+    "test_accessors.py": ("test_a_volume_that_was_moved",),
     "test_units.py": ("test_powers_of_two",),
     "test_without_x64.py": ("test_float64_input",),
     "trace/test_raycast.py": ("test_touching_boxes", "test_rays_that_miss"),

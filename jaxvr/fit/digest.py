@@ -91,13 +91,15 @@ def _feed(update: Callable[[Any], Any], x: Any, known: dict[int, Any]) -> None:
     elif isinstance(x, set | frozenset):
         say(f"set of {len(x)}")
         feed(*sorted(data(part) for part in x))
-    elif hasattr(x, "jaxpr") and hasattr(x, "consts"):  # jax.extend.core.ClosedJaxpr
+    elif hasattr(x, "consts") and getattr(x, "jaxpr", x) is not x:  # jax.extend.core.ClosedJaxpr
         say("closed")
         feed(x.jaxpr, list(x.consts))
     elif hasattr(x, "eqns") and hasattr(x, "invars"):  # jax.extend.core.Jaxpr
         if id(x) not in known:
             inner = hashlib.blake2b(digest_size=16)
             _feed_jaxpr(inner.update, x, known)
+            # Newer versions of JAX have one class for both.
+            _feed(inner.update, list(getattr(x, "consts", ())), known)
             known[id(x)] = inner.hexdigest(), x
         say(f"program {known[id(x)][0]}")
     elif dataclasses.is_dataclass(x):

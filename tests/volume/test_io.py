@@ -548,6 +548,7 @@ def test_a_forked_process_closes_what_it_got(tmp_path, monkeypatch):
     read_mesh(tmp_path / "a.vtu")
     (worker,) = pool.idle
     process._forked()
-    assert process._pool is not pool and worker.stdin.closed and worker.stdout.closed
+    assert process._pool is not pool and worker.stdin and worker.stdout
+    assert worker.stdin.closed and worker.stdout.closed
     os.waitpid(worker.pid, 0)  # it ends with its input
     assert worker.returncode == 0
