@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvr._core.checks import (
-    BRIGHTEST,
     as_floats,
+    as_light,
     is_concrete,
     require_finite,
     require_kind,
-    require_light,
 )
 from jaxvr.adjoint import AbstractAdjoint, Replay
 from jaxvr.composite import Over
@@ -34,13 +33,10 @@ def background_of(background: Any) -> Array | None:
     """RGB (3,), or None."""
     if background is None:
         return None
-    given, background = background, as_floats("background", background)
-    if background.shape != (3,):
-        raise ValueError(f"background must be RGB with shape (3,), but has {background.shape}.")
-    # In integers black and white are what they are in floats; dark bytes are not.
-    whole = is_concrete(given) and np.asarray(given).dtype.kind in "iu"
-    require_light("background", background, most=1 if whole else BRIGHTEST)
-    return jnp.asarray(background)
+    light = as_light("background", background)
+    if light.shape != (3,):
+        raise ValueError(f"background must be RGB with shape (3,), but has {light.shape}.")
+    return jnp.asarray(light)
 
 
 def dtype_of(volume: Any) -> Any:

@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from jaxvr._core.checks import as_floats, require_finite
+from jaxvr._core.checks import as_floats, as_light, require_finite
 from jaxvr._core.writing import beside, require_place, whole_file
-from jaxvr.arguments import background_of
 from jaxvr.render import render
 from jaxvr.view import images as _images
 from jaxvr.view.camera import Camera
@@ -187,7 +186,7 @@ def _floats(image: Any, background: Any) -> np.ndarray:
     _require_image(image)
     require_finite("image", image)
     if image.shape[-1] == 4 and background is not None:
-        background_of(background)
+        as_light("background", background)
         image = np.asarray(_images.composite_over(image, background))[..., :3]
     return image
 

@@ -281,6 +281,8 @@ def test_colours_of_a_background_in_bytes(mesh, camera, tmp_path):
             jaxvr.render(mesh, camera, ramp(), background=background)
         with pytest.raises(ValueError, match="background holds .* from 0 to 1. Divide .* by 255"):
             jaxvr.save_image(tmp_path / "a.png", np.zeros((4, 4, 4)), background=background)
+        with pytest.raises(ValueError, match="background holds .* from 0 to 1. Divide .* by 255"):
+            jaxvr.plot.image(np.zeros((4, 4, 4)), background=background)
 
 
 def test_a_fit_that_sees_nothing(mesh, camera):

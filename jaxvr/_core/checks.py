@@ -89,6 +89,15 @@ def refuse_bytes(name: str, x: Any, hint: str = "") -> None:
         raise ValueError(f"{what} {hint}".rstrip())
 
 
+def as_light(name: str, x: Any) -> Any:
+    """Colours as `as_floats` gives them, or a ValueError as `require_light` says. In integers black
+    and white are what they are in floats, and what is above 1 is bytes, however dark."""
+    light = as_floats(name, x)
+    whole = is_concrete(x) and np.asarray(x).dtype.kind in "iu"
+    require_light(name, light, most=1 if whole else BRIGHTEST)
+    return light
+
+
 def require_light(name: str, x: Any, most: float = BRIGHTEST) -> None:
     """ValueError for colours with NaN or infinite entries, and for bytes, which `most` tells from
     light (if concrete)."""

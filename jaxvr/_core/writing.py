@@ -46,24 +46,48 @@ def beside(path: Any) -> Iterator[Path]:
     if place.exists() and not stat.S_ISREG(place.stat().st_mode) and not place.is_dir():
         yield place  # a device or a pipe: nothing can take its place
         return
-    if place.is_file() and not os.access(place, os.W_OK):  # which a new name would get round
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(place))
+    _require_writable(place)
     name = f"{_mark(place)}{os.getpid()}-{secrets.token_hex(6)}{place.suffix[:16]}"
     part = place.with_name(name)
     os.close(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
         yield part
-        with open(part, "rb+") as file:
-            os.fsync(file.fileno())
-        if place.is_file():
-            with contextlib.suppress(OSError):
-                shutil.copymode(place, part)
-        os.replace(part, place)
+        move(part, place)
     except BaseException:
         with contextlib.suppress(OSError):
             part.unlink()
         raise
-    _sync(place.parent)
+
+
+def move(made: Path, place: Path) -> None:
+    """A finished file to its place in the same file system, at once, and both on the disk.
+
+    A file that is there is replaced and its mode is kept. Raises OSError, also where that file may
+    not be written.
+    """
+    _require_writable(place)
+    sync(made)
+    if place.is_file():
+        with contextlib.suppress(OSError):
+            shutil.copymode(place, made)
+    os.replace(made, place)
+    with contextlib.suppress(OSError):  # folders cannot be synced everywhere
+        sync(place.parent)
+
+
+def sync(path: Path) -> None:
+    """The content of a file, or the names in a folder, to the disk."""
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _require_writable(place: Path) -> None:
+    """PermissionError for a file that may not be written, which a new name would get round."""
+    if place.is_file() and not os.access(place, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(place))
 
 
 @contextlib.contextmanager
@@ -91,8 +115,7 @@ def require_place(path: Any, what: str) -> None:
             raise IsADirectoryError(f"{what} cannot be written to {shown(path)}: it is a folder.")
         if place.exists() and not place.is_file():
             return
-        if place.is_file() and not os.access(place, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(place))
+        _require_writable(place)
         _sweep(place)
         part = place.with_name(f"{_mark(place)}{os.getpid()}-{secrets.token_hex(6)}")
         try:
@@ -139,13 +162,3 @@ def _runs(pid: int) -> bool:
     except (OSError, OverflowError):
         pass
     return True
-
-
-def _sync(folder: Path) -> None:
-    """So that the new name, too, is on the disk; where folders can be synced."""
-    with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

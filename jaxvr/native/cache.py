@@ -22,6 +22,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from jaxvr._core.writing import sync
+
 DIGITS = 20
 SCRATCH = "tmp-jaxvr-"
 # A build takes minutes at most: what is older was left by one that was killed.
@@ -139,16 +141,11 @@ def remove(file: Path) -> None:
 def publish(made: Path, folder: Path, name: str) -> Path:
     """Moves a finished library to its place, at once, so that processes may build side by side."""
     made.chmod(0o700)
-    with made.open("rb") as file:
-        os.fsync(file.fileno())
+    sync(made)
     target = folder / f"{name}-{digest_of(made)}.so"
-    made.replace(target)
+    made.replace(target)  # whose mode does not count, as it does in `writing.move`
     with contextlib.suppress(OSError):  # not all file systems have it
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        sync(folder)
     return target
 
 

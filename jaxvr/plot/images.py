@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 
-from jaxvr._core.checks import as_floats, require_finite, require_kind, require_light
+from jaxvr._core.checks import as_floats, as_light, require_finite, require_kind
 from jaxvr.files import pixels
 from jaxvr.optics.transfer import TransferFunction
 from jaxvr.plot.axes import color_as, given, grid_axes, ink, picture_axes, set_title
@@ -228,7 +228,7 @@ def _opaque(image: Any, background: Any) -> np.ndarray:
     """An image over a background, (H, W, 3) in float64."""
     image = as_floats("image", image, ndim=3)
     if image.shape[-1] == 4:
-        require_light("background", as_floats("background", background))
+        as_light("background", background)
         image = composite_over(image, background)
     require_finite("image", image)
     return np.asarray(image, np.float64)[..., :3]

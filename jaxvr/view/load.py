@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxvr._core.checks import as_floats, require_finite, require_light
+from jaxvr._core.checks import as_light, require_finite, require_light
 from jaxvr._core.warn import warn
 from jaxvr._core.writing import place_of, shown
 from jaxvr.view.images import composite_over
@@ -109,7 +109,7 @@ def load_image(
     if alpha == "straight" or (alpha is None and straight):
         image[..., :3] *= image[..., 3:]
     if background is not None:
-        require_light("background", as_floats("background", background))
+        as_light("background", background)
         image = np.array(composite_over(image, background))
     if dtype is None:
         dtype = np.float64 if pixels.dtype == np.float64 else np.float32

@@ -28,7 +28,7 @@ from .._core.checks import is_concrete, require_finite
 from .._core.status import BROKEN, LOST
 from . import packing
 from .connectivity import FACES, entries_agree
-from .mirror import enclosed, mirrored
+from .mirror import enclosed, mirrored, outer_faces
 
 Array = jax.Array
 
@@ -157,9 +157,7 @@ def _is_closed(mesh: Any) -> Array:
     has a chance of 2^-32 otherwise.
     """
     rows, words = _welded(mesh.cells, mesh.duplicates, mesh.points.shape[0]), mesh.boundary
-    cell = jnp.clip(packing.cell_of(words), 0, rows.shape[0] - 1)
-    face = jnp.asarray(FACES)[packing.corner_of(words)]
-    a, b, c = jnp.take_along_axis(rows[cell], face, axis=1).T
+    a, b, c = outer_faces(rows, words, jnp).T
     total = _noise(a, b) + _noise(b, c) - _noise(a, c)
     total = jnp.where(packing.flag_of(words) == 1, -total, total)
     return jnp.sum(total, dtype=jnp.uint32) == 0

@@ -18,6 +18,13 @@ from .geometry import flat_cells, signed_volumes
 _MANY = 0.25  # part of the volume at the boundary above which a mesh turned over is worth a word
 
 
+def outer_faces(cells: Any, boundary: Any, xp: Any = np) -> Any:
+    """Ids (F, 3) out of those of cells (T, 4), for the faces that the boundary's words name."""
+    cell = xp.clip(packing.cell_of(boundary), 0, cells.shape[0] - 1)
+    face = xp.asarray(conn.FACES)[packing.corner_of(boundary)]
+    return xp.take_along_axis(cells[cell], face, axis=1)
+
+
 def enclosed(points: Any, cells: Any, boundary: Any, xp: Any = np) -> tuple[Any, Any]:
     """What each face of the boundary adds to six times the volume that it encloses, as its `entry`
     bit orients it (F,), in units of the mesh's own, and how much rounding may add to that (F,).
@@ -26,9 +33,7 @@ def enclosed(points: Any, cells: Any, boundary: Any, xp: Any = np) -> tuple[Any,
     from outside, wherever o is: that of a mirrored mesh is below 0, whatever its cells are. A
     determinant errs by no more than some ulps of |a - o| |b - o| |c - o|. xp: NumPy, or jax.numpy.
     """
-    cell = xp.clip(packing.cell_of(boundary), 0, cells.shape[0] - 1)
-    face = xp.asarray(conn.FACES)[packing.corner_of(boundary)]
-    corners = points[xp.take_along_axis(cells[cell], face, axis=1)]
+    corners = points[outer_faces(cells, boundary, xp)]
     low, high = (f(corners, (0, 1), keepdims=True) for f in (xp.min, xp.max))
     corners = corners - 0.5 * (low + high)
     limits = xp.finfo(points.dtype)

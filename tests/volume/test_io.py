@@ -1,6 +1,7 @@
 """Kinds of files, and what goes wrong with them: nothing is left out in silence."""
 
 import enum
+import errno
 import os
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 
 from experiments import file_kinds, file_makers
 from jaxvr.volume import Field, TetMesh, datasets, list_fields, read_mesh, write_mesh
-from jaxvr.volume.io import exodus, fields, meshio_files, process, registry, sizes
+from jaxvr.volume.io import exodus, fields, meshio_files, process, registry, sizes, write
 from jaxvr.volume.io.content import Ask, Content, Part, Trouble, join
 
 # What packages that are not among those of the tests write.
@@ -552,3 +553,16 @@ def test_a_forked_process_closes_what_it_got(tmp_path, monkeypatch):
     assert worker.stdin.closed and worker.stdout.closed
     os.waitpid(worker.pid, 0)  # it ends with its input
     assert worker.returncode == 0
+
+
+def test_a_mesh_that_may_not_be_written_stays(tmp_path, monkeypatch):
+    place = tmp_path / "a.vtu"
+    write_mesh(place, datasets.box((1, 1, 1)))
+    before = place.read_bytes()
+    access = os.access  # root may write to anything
+    monkeypatch.setattr(os, "access", lambda p, mode: access(p, mode) and mode != os.W_OK)
+    mesh = np.eye(4)[:, :3], np.arange(4)[None], "s", np.arange(4.0), "point"
+    with pytest.raises(Trouble) as caught:
+        write.write(str, str(place), *mesh, str(tmp_path / "workshop"))
+    assert caught.value.kind == "system" and str(errno.EACCES) in caught.value.message
+    assert place.read_bytes() == before and list(tmp_path.iterdir()) == [place]

@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxvr._core.writing import move
+
 from .content import Trouble
 
 _WHOLE = (".vtu", ".vtk")  # formats that hold all there is
@@ -82,15 +84,4 @@ def _require_whole(made: Path, n: int, name: str, location: str, said: Callable[
 def _move(folder: Path, file: Path) -> None:
     """The files of a folder to the place of `file`, which comes last."""
     for made in sorted(folder.iterdir(), key=lambda p: p.name == file.name):
-        with open(made, "rb+") as f:
-            os.fsync(f.fileno())
-        place = file.parent / made.name
-        if place.is_file():
-            shutil.copymode(place, made)
-        os.replace(made, place)
-    if os.name == "posix":
-        fd = os.open(file.parent, os.O_RDONLY)
-        try:
-            os.fsync(fd)
-        finally:
-            os.close(fd)
+        move(made, file.parent / made.name)
