@@ -33,10 +33,10 @@ def background_of(background: Any) -> Array | None:
     """RGB (3,), or None."""
     if background is None:
         return None
-    light = as_light("background", background)
-    if light.shape != (3,):
-        raise ValueError(f"background must be RGB with shape (3,), but has {light.shape}.")
-    return jnp.asarray(light)
+    shape = as_floats("background", background).shape
+    if shape != (3,):
+        raise ValueError(f"background must be RGB with shape (3,), but has {shape}.")
+    return jnp.asarray(as_light("background", background))
 
 
 def dtype_of(volume: Any) -> Any:
