@@ -12,6 +12,7 @@ No type checker knows of attributes that one package gives to the classes of ano
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import warnings
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from jaxvr._core.offsets import NOWHERE
 from jaxvr.defaults import default_transfer
 from jaxvr.files import pixels, save_image
 from jaxvr.optics import TransferFunction
@@ -221,8 +223,8 @@ def _data(volume: Any) -> TetMesh:
     matrix = volume.GetMatrix()
     if not matrix.IsIdentity():
         m = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
-        points = np.asarray(mesh.points, np.float64) @ m[:3, :3].T + m[:3, 3]
-        mesh = mesh.replace(points=points.astype(mesh.dtype))
+        points = mesh.absolute_points() @ m[:3, :3].T + m[:3, 3]
+        mesh = dataclasses.replace(mesh, origin=NOWHERE).replace(points=points)
     return mesh
 
 
@@ -256,12 +258,13 @@ def _look(volume: Any) -> TransferFunction:
     unit = look.GetScalarOpacityUnitDistance()
     opacities = np.asarray(transfer.extinctions, np.float64) * unit
     return TransferFunction.from_opacity(
-        transfer.positions,
+        transfer.absolute_positions(),
         transfer.colors,
         np.clip(opacities, 0, 1).astype(transfer.positions.dtype),
         unit,
         "grid",
         max_opacity=OPAQUE,
+        dtype=transfer.dtype,
     )
 
 

@@ -5,6 +5,7 @@ Each raises a `ValueError` that says what was found.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -18,6 +19,8 @@ from jaxvr._core.checks import (
     require_finite,
     require_kind,
 )
+from jaxvr._core.offsets import FAR, NOWHERE, Origin, relative, said
+from jaxvr._core.warn import warn
 from jaxvr.adjoint import AbstractAdjoint, Replay
 from jaxvr.composite import Over
 from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
@@ -48,6 +51,15 @@ def _cast(tree: Any, dtype: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), tree)
 
 
+def bare(x: Any) -> Any:
+    """A mesh, camera, segments or transfer function without its offset, which compiled functions
+    need not know: for another one they are not compiled again."""
+    if isinstance(x, TransferFunction):
+        return TransferFunction.tree_unflatten(0.0, x.tree_flatten()[0])
+    blank = {"origin": NOWHERE, "offset": 0.0}
+    return dataclasses.replace(x, **{name: to for name, to in blank.items() if hasattr(x, name)})
+
+
 def volume_of(volume: Any) -> TetMesh:
     require_kind("volume", volume, TetMesh, "Read files with jaxvr.read_mesh.")
     require_mesh(volume)
@@ -55,19 +67,49 @@ def volume_of(volume: Any) -> TetMesh:
 
 
 def camera_of(camera: Any, volume: Any) -> Camera:
+    """The camera with eye and target relative to the volume's origin."""
     require_kind("camera", camera, Camera)
     for name in ("eye", "target", "up", "fov", "extent"):
         part = getattr(camera, name)
         if part is not None:
             require_finite(f"camera.{name}", part)
-    return _cast(camera, dtype_of(volume))
+    dtype = dtype_of(volume)
+    if camera.origin != volume.origin:
+        _require_digits(camera, volume.origin)
+        camera = _cast(camera, jnp.promote_types(camera.dtype, dtype)).relative_to(volume.origin)
+    return _cast(camera, dtype)
+
+
+def _require_digits(camera: Camera, origin: Origin) -> None:
+    """Warns of a camera in float32 whose place beside a volume far from 0 is rounded, since it was
+    made inside `jit` or of JAX's arrays."""
+    if any(camera.origin) or camera.dtype != np.float32:
+        return
+    if is_concrete(camera.eye, camera.target):
+        eye, target = camera.absolute()
+        if np.abs(origin).max() <= FAR * np.abs(eye - target).max():
+            return
+    step = np.spacing(np.float32(np.abs(origin).max()))
+    warn(
+        f"The camera's eye and target are float32, with steps of {step:.2g} beside a volume at "
+        f"{said(origin)}. Make it outside jit of plain numbers or NumPy's float64, or with "
+        "Camera.orbit(volume), and move it with camera.replace(eye=..., origin=camera.origin).",
+        UserWarning,
+    )
 
 
 def transfer_of(transfer: Any, volume: Any) -> TransferFunction:
+    """The transfer function with positions relative to the offset of a mesh or of segments."""
     require_kind("transfer", transfer, TransferFunction)
     # Its numbers may have been computed with since it was made: the same checks once more.
-    transfer = TransferFunction(transfer.positions, transfer.colors, transfer.extinctions)
-    return _cast(transfer, dtype_of(volume))
+    transfer = TransferFunction(
+        transfer.positions, transfer.colors, transfer.extinctions, offset=transfer.offset
+    )
+    dtype = dtype_of(volume)
+    if transfer.offset != volume.offset:
+        transfer = _cast(transfer, jnp.promote_types(transfer.dtype, dtype))
+        transfer = transfer.relative_to(volume.offset)
+    return _cast(transfer, dtype)
 
 
 def segments_of(segments: Any) -> Segments:
@@ -110,9 +152,21 @@ def _noun(name: str, given: Any, method: str, default: type) -> Any:
 
 
 def rays_of(origins: Any, directions: Any, volume: Any) -> tuple[Array, Array]:
-    """Origins and directions of one shape (..., 3), the latter not zero."""
+    """Origins and directions of one shape (..., 3), the latter not zero; the former relative to the
+    volume's origin."""
     dtype = dtype_of(volume)
-    origins, directions = as_floats("origins", origins), as_floats("directions", directions)
+    if isinstance(origins, jax.Array):
+        if any(volume.origin) and origins.dtype == np.float32:
+            step = np.spacing(np.float32(np.abs(volume.origin).max()))
+            warn(
+                f"origins are JAX's float32, with steps of {step:.2g} beside a volume at "
+                f"{said(volume.origin)}. Pass NumPy's float64.",
+                UserWarning,
+            )
+        origins = as_floats("origins", origins)
+    else:
+        origins = as_floats("origins", origins, dtype=np.float64)
+    directions = as_floats("directions", directions)
     for name, x in (("origins", origins), ("directions", directions)):
         if x.ndim == 0 or x.shape[-1] != 3:
             raise ValueError(f"{name} must have shape (..., 3), but has {x.shape}.")
@@ -125,6 +179,8 @@ def rays_of(origins: Any, directions: Any, volume: Any) -> tuple[Array, Array]:
         if none.any():
             first = tuple(int(i) for i in np.argwhere(none)[0])
             raise ValueError(f"{int(none.sum())} direction(s) are zero, the first at {first}.")
+    if any(volume.origin):
+        origins = relative(origins, volume.origin, dtype)
     origins, directions = (
         jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in (origins, directions)
     )

@@ -14,6 +14,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from jaxvr._core.brief import spanned
+from jaxvr._core.offsets import absolute
 from jaxvr._core.status import RenderError
 from jaxvr._core.warn import warn
 from jaxvr._core.writing import place_of
@@ -86,10 +88,10 @@ def picture(arguments: Any) -> None:
     else:
         save_image(out, image)
     low, high = value_range(mesh)
-    first, last = (float(transfer.positions[k]) for k in (0, -1))
+    ends = transfer.absolute_positions()[[0, -1]]
     size = f"{image.shape[1]} x {image.shape[0]}, mean alpha {image[..., 3].mean():.3f}"
     print(f"{out}  {size}")
-    print(f"field {field}, {low:.6g} to {high:.6g}, colours from {first:.6g} to {last:.6g}; {view}")
+    print(f"field {field}, {spanned(low, high)}, colours from {spanned(*ends)}; {view}")
 
 
 def recover(arguments: Any) -> None:
@@ -105,9 +107,9 @@ def recover(arguments: Any) -> None:
     look = {"background": arguments.background}
     targets = [np.asarray(render(mesh, c, reference, **look)) for c in cameras]
     unseen = np.asarray(render(mesh, held_out, reference, **look))
-    first, last = (float(reference.positions[k]) for k in (0, -1))
-    positions = np.linspace(first, last, arguments.points).astype(mesh.dtype)
-    start = noise(positions, _typical(reference, mesh), arguments.seed)
+    first, last = reference.absolute_positions()[[0, -1]]
+    positions = np.linspace(first, last, arguments.points)
+    start = noise(positions, _typical(reference, mesh), arguments.seed, dtype=mesh.dtype)
     result = fit(
         start,
         mesh,
@@ -185,7 +187,7 @@ def _camera(mesh: TetMesh, transfer: TransferFunction, arguments: Any) -> tuple[
         return camera, f"{name} up, which shows most (--up)" if name else f"up {_numbers(up)}"
     if given:
         raise ValueError(f"--eye says where from: leave out {', '.join('--' + x for x in given)}.")
-    low, high = (np.asarray(x, np.float64) for x in mesh.bounds())
+    low, high = (absolute(x, mesh.origin) for x in mesh.bounds())
     up = a.up or UPS["z" if abs(_along(low, high, a.eye)[1]) > 0.99 else "y"]
     camera = Camera.look_at(a.eye, (low + high) / 2, up, **size, dtype=mesh.dtype)
     return camera, f"up {_numbers(up)}"

@@ -70,10 +70,13 @@ def default_transfer(
     if not high - low > NOISE * (most - least):
         low, high = least, most
     # Where few numbers lie between the two, there are fewer points.
-    positions = np.unique(np.linspace(low, high, points).astype(volume.dtype))
+    positions = np.linspace(low, high, points) - volume.offset
+    positions = np.unique(positions.astype(volume.dtype))
     ramp = np.linspace(0, 1, len(positions)) if len(positions) > 1 else np.ones(1)
     extinctions = (depth / diagonal(volume) * ramp).astype(volume.dtype)
-    return TransferFunction.from_colormap(colormap, positions, extinctions, dtype=volume.dtype)
+    return TransferFunction.from_colormap(
+        colormap, positions, extinctions, offset=volume.offset, dtype=volume.dtype
+    )
 
 
 def best_up(volume: TetMesh, transfer: TransferFunction, **view: Any) -> str:
@@ -90,11 +93,11 @@ def best_up(volume: TetMesh, transfer: TransferFunction, **view: Any) -> str:
     points = np.asarray(volume.points, np.float64)
     size = np.abs(signed_volumes(points, cells)[0]) / 6
     points = points[cells]
-    values = np.asarray(volume.values, np.float64)
+    values = volume.absolute_values()
     if volume.location == "point":
         values = values[cells]
     values = values if values.ndim == 1 else values.mean(axis=1)
-    x = np.asarray(transfer.positions, np.float64)
+    x = transfer.absolute_positions()
     columns = [*np.asarray(transfer.colors, np.float64).T, np.asarray(transfer.extinctions)]
     numbers = np.stack([np.interp(values, x, np.asarray(c, np.float64)) for c in columns], axis=1)
     n = int(np.clip(np.cbrt(len(points)), 4, 32))

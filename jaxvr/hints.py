@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ._core.brief import spanned
 from ._core.checks import is_concrete
 from ._core.units import near_one, norm
 from .optics import TransferFunction
@@ -69,6 +70,7 @@ def look(
         return
     glance = np.asarray(_glance(camera.extent is not None, seen, *floats))
     alpha, low, high, first, last, top, diagonal, cut = (float(x) for x in glance)
+    low, high, first, last = (x + volume.offset for x in (low, high, first, last))
     odd = _odd((low, high), (first, last))
     # A cheap look at what `_dense` looks at again.
     dense = top <= 1 and top * diagonal > max(DENSE, DENSE_CELL * volume.n_tets ** (1 / 3))
@@ -108,7 +110,8 @@ def look_before_fit(
 def _unseen(volume: TetMesh, views: dict[int, Camera]) -> str | None:
     """Which cameras do not see the volume, and why the first of them does not."""
     points = _used(volume)
-    reasons = {k: _out_of_view(points, camera) for k, camera in views.items()}
+    here = {k: camera.relative_to(volume.origin) for k, camera in views.items()}
+    reasons = {k: _out_of_view(points, camera) for k, camera in here.items()}
     blind = [k for k, reason in reasons.items() if reason]
     if not blind:
         return None
@@ -122,7 +125,8 @@ def _unfit(volume: TetMesh, transfer: TransferFunction) -> str | None:
     """How the control points of a start miss the field. What they hold changes: a ramp over them
     stands for what they can hold."""
     ramp = np.linspace(1, 2, len(transfer.positions))
-    ramp = TransferFunction(transfer.positions, np.stack([ramp - 1] * 3, axis=1), ramp)
+    colors = np.stack([ramp - 1] * 3, axis=1)
+    ramp = TransferFunction(transfer.positions, colors, ramp, offset=transfer.offset)
     field = value_range(volume)
     return _ranges(volume, ramp, field) if _odd(field, _ends(ramp)) else None
 
@@ -200,6 +204,7 @@ def _out_of_view(points: np.ndarray, camera: Camera) -> str | None:
     offset = points - eye
     depth, x, y = offset @ forward, offset @ right, offset @ np.cross(right, forward)
     low, high = points.min(axis=0), points.max(axis=0)
+    low, high, place, aim = (x + np.asarray(camera.origin) for x in (low, high, eye, target))
     box = f"its box reaches from {_vector(low)} to {_vector(high)}"
     advice = (
         f"Point it at the middle of the box, target={_vector((low + high) / 2)}, or take "
@@ -207,7 +212,7 @@ def _out_of_view(points: np.ndarray, camera: Camera) -> str | None:
     )
     if (depth <= 0).all():
         return (
-            f"The volume lies behind the camera, which stands at {_vector(eye)} and looks along "
+            f"The volume lies behind the camera, which stands at {_vector(place)} and looks along "
             f"{_vector(forward)}; {box}. {advice}"
         )
     if camera.fov is not None:
@@ -226,8 +231,8 @@ def _out_of_view(points: np.ndarray, camera: Camera) -> str | None:
     for side, beyond in sides.items():
         if beyond.all():
             return (
-                f"The volume lies {side} the picture; {box}, and the camera at {_vector(eye)} "
-                f"looks at {_vector(target)}. {advice}"
+                f"The volume lies {side} the picture; {box}, and the camera at {_vector(place)} "
+                f"looks at {_vector(aim)}. {advice}"
             )
     if (depth > 0).all():
         pixel = 2 * reach / camera.height
@@ -235,7 +240,7 @@ def _out_of_view(points: np.ndarray, camera: Camera) -> str | None:
         if size < 1:
             return (
                 f"The volume is {size:.2g} pixels large; {box}, and the camera stands at "
-                f"{_vector(eye)}. Move it nearer, or take Camera.orbit(volume)."
+                f"{_vector(place)}. Move it nearer, or take Camera.orbit(volume)."
             )
     return None
 
@@ -303,7 +308,8 @@ def _inside(volume: TetMesh, camera: Camera) -> str | None:
     so that a flight through a volume is warned of once: Python tells equal warnings once."""
     low, high = (np.asarray(x, np.float64) for x in volume.bounds())
     eye, target = (np.asarray(x, np.float64) for x in (camera.eye, camera.target))
-    box = f"the volume's box, from {_vector(low)} to {_vector(high)}"
+    ends = (_vector(x + np.asarray(volume.origin)) for x in (low, high))
+    box = f"the volume's box, from {' to '.join(ends)}"
     if camera.extent is None:
         if not ((low < eye) & (eye < high)).all():
             return None  # only points that no cell uses lie around it
@@ -333,16 +339,17 @@ def _numbers(transfer: TransferFunction) -> np.ndarray:
 def _shown(volume: TetMesh, transfer: TransferFunction, field: tuple[float, float]) -> np.ndarray:
     """What the field can take (n, 4) of the colours and extinctions: those at its two ends and
     at the control points between them, or, where it is constant in cells, those at its values."""
-    positions, numbers = np.asarray(transfer.positions, np.float64), _numbers(transfer)
+    positions, numbers = transfer.absolute_positions(), _numbers(transfer)
     cellwise = volume.location == "cell"
-    at = np.asarray(volume.values, np.float64) if cellwise else np.array(field)
+    at = volume.absolute_values() if cellwise else np.array(field)
     shown = np.stack([np.interp(at, positions, column) for column in numbers.T], axis=1)
     within = (positions >= field[0]) & (positions <= field[1])
     return shown if cellwise else np.concatenate([shown, numbers[within]])
 
 
 def _ends(transfer: TransferFunction) -> tuple[float, float]:
-    return float(transfer.positions[0]), float(transfer.positions[-1])
+    positions = transfer.absolute_positions()
+    return float(positions[0]), float(positions[-1])
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
@@ -350,12 +357,12 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def _range(low: float, high: float) -> str:
-    return f"{low:.6g} to {high:.6g}"
+    return spanned(low, high)
 
 
 def _vector(v: np.ndarray) -> str:
     v = np.where(np.abs(v) > 1e-7 * np.abs(v).max(), v, 0.0)  # rounding, and -0
-    return "(" + ", ".join(f"{x:.4g}" for x in v) + ")"
+    return "(" + ", ".join(f"{x:.4g}" if abs(x) < 1e4 else f"{x:.9g}" for x in v) + ")"
 
 
 def _short(x: float) -> str:

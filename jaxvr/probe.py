@@ -17,9 +17,11 @@ import numpy as np
 from jax import lax
 
 from jaxvr._core.checks import is_concrete
+from jaxvr._core.offsets import absolute
 from jaxvr._core.status import check
 from jaxvr.adjoint.base import Operands, Pipeline, advance, begin, busy, shade_piece
 from jaxvr.arguments import (
+    bare,
     camera_of,
     integrator_of,
     rays_of,
@@ -46,9 +48,9 @@ class Probe:
     start (R + 1,): the segments of ray r are number start[r] to start[r + 1] - 1.
     cells (S,) int32: rows of `mesh.cells`, the tetrahedra that the segments lie in.
     distances (S, 2): from the ray's origin to the front and the back, in world units.
-    scalars (S, 2): the field at front and back.
+    scalars (S, 2): the field at front and back; float64 where the mesh has an offset.
     contributions (S, 4): premultiplied RGBA that each adds at the eye, dimmed by what is in front.
-    positions (S, 2, 3): the front and the back, in world units.
+    positions (S, 2, 3): the front and the back, in the world; float64 where the mesh has an origin.
     """
 
     start: np.ndarray
@@ -117,7 +119,7 @@ def probe(
         raise ValueError("probe cannot run inside jit or grad. Call it outside.")
     volume, transfer = volume_of(volume), transfer_of(transfer, volume)
     if isinstance(camera, Camera):
-        origins, directions = (np.asarray(x) for x in camera_of(camera, volume).rays())
+        origins, directions = (np.asarray(x) for x in camera_of(camera, volume).local_rays())
         if pixels is not None:
             row, column = _pixels_of(pixels, origins.shape[:2])
             origins, directions = origins[row, column], directions[row, column]
@@ -133,7 +135,7 @@ def probe(
     pipeline = Pipeline(tracer_of(tracer), integrator_of(integrator), Over())
     size = min(batch_size(volume.dtype), 1 << max(len(origins) - 1, 0).bit_length())
     parts, counts, status = [], [], []
-    scene, table, units = _prepare(pipeline, volume, transfer)
+    scene, table, units = _prepare(pipeline, bare(volume), bare(transfer))
     start_at = origins * np.asarray(units.length)
     for first in range(0, len(origins), size):
         here = np.minimum(np.arange(first, first + size), len(origins) - 1)
@@ -155,6 +157,10 @@ def probe(
     distances = np.stack([np.maximum(back - length, 0), back], axis=1)
     ray = np.repeat(np.arange(len(origins)), np.diff(start))
     positions = origins[ray][:, None] + distances[..., None] * directions[ray][:, None]
+    if any(volume.origin):
+        positions = absolute(positions, volume.origin)
+    if volume.offset:
+        scalars = absolute(scalars, volume.offset)
     return Probe(start, cells, distances, scalars, contributions, positions)
 
 

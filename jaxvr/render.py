@@ -31,6 +31,7 @@ from jaxvr.adjoint.replay import settle
 from jaxvr.arguments import (
     adjoint_of,
     background_of,
+    bare,
     camera_of,
     compositor_of,
     dtype_of,
@@ -162,7 +163,8 @@ def render(
     transfer = transfer_of(transfer, volume)
     how = _how(pipeline, adjoint, budget, volume)
     with refusing(how[1]):
-        image, bits, seen = _render(*how, volume, camera, transfer, background_of(background))
+        scene = bare(volume), bare(camera), bare(transfer)
+        image, bits, seen = _render(*how, *scene, background_of(background))
     bits = hold(volume, bits)
     if status:
         return image, bits
@@ -240,7 +242,8 @@ def render_rays(
     """The colours that rays see.
 
     Args:
-      origins, directions (..., 3): rays from the origins onwards; origins may be in the volume.
+      origins, directions (..., 3): rays from the origins onwards; origins may be in the volume. In
+        the world: beside a volume that has an `origin` pass NumPy's float64.
         Directions of any length but zero: optical lengths are world lengths. Neighbours in the
         array should be neighbours in space, for speed.
       status: also return the status bits (...,) int32 of each ray, for `jaxvr.check`.
@@ -255,9 +258,8 @@ def render_rays(
     transfer = transfer_of(transfer, volume)
     how = _how(pipeline, adjoint, budget, volume)
     with refusing(how[1]):
-        rgba, bits = _render_rays(
-            *how, volume, origins, directions, transfer, background_of(background)
-        )
+        scene = bare(volume), origins, directions, bare(transfer)
+        rgba, bits = _render_rays(*how, *scene, background_of(background))
     bits = hold(volume, bits)
     if status:
         return rgba, bits
@@ -296,12 +298,13 @@ def trace(
     if isinstance(camera, Camera):
         camera = camera_of(camera, volume)
         shape, order = (camera.height, camera.width), tile_order(camera.height, camera.width)
-        origins, directions = (x.reshape(-1, 3)[order] for x in camera.rays())
+        origins, directions = (x.reshape(-1, 3)[order] for x in camera.local_rays())
     else:
         origins, directions = rays_of(*camera, volume)
         shape, order = origins.shape[:-1], np.arange(origins.size // 3)
         origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     how = (tracer, compiled.covers(native, volume.dtype, tracer), _batch_size(budget, volume))
+    offset, volume = volume.offset, bare(volume)
     counts, status = _count(*how, volume, origins, directions)
     check(status)
     # Rays of like length together: then no ray of a batch waits for the others when shaded.
@@ -323,6 +326,7 @@ def trace(
         jnp.asarray(status),
         jnp.asarray(order, jnp.int32),
         shape=tuple(shape),
+        offset=offset,
     )
 
 
@@ -350,7 +354,7 @@ def shade(
     transfer = transfer_of(transfer, segments)
     how = _how(pipeline, adjoint, budget, segments)
     with refusing(how[1]):
-        image, bits = _shade(*how, segments, transfer, background_of(background))
+        image, bits = _shade(*how, bare(segments), bare(transfer), background_of(background))
     if is_concrete(bits):
         check(bits)
     return image
@@ -377,7 +381,7 @@ def _render(pipeline, adjoint, size, volume, camera, transfer, background):
     # Under a user's own jit operands may be constants: XLA must not compute with them itself.
     volume, camera = lax.optimization_barrier((volume, camera))
     height, width = camera.height, camera.width
-    origins, directions = (tile(x) for x in camera.rays())
+    origins, directions = (tile(x) for x in camera.local_rays())
     rgba, status = _run(pipeline, adjoint, size, volume, origins, directions, transfer)
     seen = lax.stop_gradient(rgba[:, 3]).max()  # for `hints`; a background hides it
     rgba = _over(untile(rgba, height, width), background)

@@ -102,4 +102,5 @@ def transfer_in(units: Units, transfer: TransferFunction) -> TransferFunction:
         transfer,
         positions=units.of_scalars(positions),
         extinctions=jnp.minimum(transfer.extinctions / units.length, most),
+        offset=0.0,
     )

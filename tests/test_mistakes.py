@@ -179,6 +179,9 @@ def test_integers(mesh):
     other = jaxvr.TransferFunction([0, 1], [[0, 0, 1], [1, 1, 0]], [1, 2], dtype="float32")
     assert all(map(np.array_equal, jax.tree.leaves(same), jax.tree.leaves(other)))
     labels = 2**24 + np.arange(mesh.n_points)
+    exact = mesh.replace(values=labels)  # close together, they are held relative to an offset
+    assert np.array_equal(exact.absolute_values(), labels)
+    labels[0] = 0
     told = r"values has 13 integers that float32 cannot hold, the first is 16777217.*offset"
     with pytest.warns(UserWarning, match=told) as caught:
         mesh.replace(values=labels)
@@ -217,13 +220,23 @@ def test_points_that_lose_digits_in_float32():
             points, cube, points[:, 0], location="point", dtype="float32"
         )
 
-    told = "points lose digits in float32. Subtract an offset .*jax_enable_x64"
-    with pytest.warns(UserWarning, match=f"degenerate .* have a volume in float64: {told}"):
-        assert build(5e6 + 1.5 * points).report.collapsed > 0
+    told = "points lose digits in float32, .*jax_enable_x64"
+    assert build(5e6 + 1.5 * points).report.collapsed == 0  # held relative to an origin
+    pair = np.concatenate([cells, cells + len(points)])
+
+    def build_two(first, second):
+        both = np.concatenate([first, second])
+        return jaxvr.TetMesh.from_cells(
+            both, {"hexahedron": pair}, both[:, 0], location="point", dtype="float32"
+        )
+
+    with pytest.warns(UserWarning) as caught:
+        assert build_two(1.5 * points, 5e6 + 1.5 * points).report.collapsed > 0
+    messages = "; ".join(str(w.message) for w in caught)
+    assert re.search(f"degenerate .* have a volume in float64: {told}", messages)
+    assert "are so small beside the steps of float32" in messages
     with pytest.raises(ValueError, match=f"No cells left.*{told}"):
-        build(1e9 + points)
-    far = 5e6 + 1.5 * points
-    assert build(far - far.mean(0)).report.collapsed == 0
+        build_two(points - 1e9, 1e9 + points)
     flat = 0.1 * np.concatenate([points, points[:1]])  # cells without volume in float64 too
     with pytest.warns(UserWarning, match=r"1 flat tetrahedra \(no volume\) kept, of 2 .*mesh.$"):
         jaxvr.TetMesh.from_cells(

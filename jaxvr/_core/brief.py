@@ -33,6 +33,21 @@ def brief(x: Any) -> str:
     return f"{dtype}[{', '.join(map(str, shape))}]"
 
 
+def spanned(low: Any, high: Any) -> str:
+    """Two numbers as "low to high", with as many digits as tell them apart, six at least."""
+    low, high = float(low), float(high)
+    digits = 6
+    while digits < 17 and low != high and _part(low, high, digits) > 1e-3:
+        digits += 1
+    return f"{low:.{digits}g} to {high:.{digits}g}"
+
+
+def _part(low: float, high: float, digits: int) -> float:
+    """How much of the difference so many digits round away."""
+    wrong = max(abs(float(f"{x:.{digits}g}") - x) for x in (low, high))
+    return wrong / abs(high - low) if max(abs(low), abs(high)) > 100 * abs(high - low) else 0.0
+
+
 def length_of(x: Any) -> str:
     """Entries along the first axis as text, "?" where there is none."""
     shape = getattr(x, "shape", None)

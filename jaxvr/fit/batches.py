@@ -13,6 +13,7 @@ the segments, and no gathering while the fit runs.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -20,7 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvr._core.pytree import pytree
+from jaxvr._core.offsets import NOWHERE, said
+from jaxvr._core.pytree import pytree, static
+from jaxvr.arguments import camera_of
 from jaxvr.fit.targets import images_of
 from jaxvr.render import trace
 from jaxvr.trace import Segments
@@ -46,6 +49,7 @@ class Views:
     """All views of a fit, on the host. P: pixels of all of them, view after view.
 
     shapes: (height, width) of each view. targets (P, C). dtype: of scalars and colours.
+    offset: what scalars are relative to.
     nodes: (scalar, length) of all segments, with first, end (P,): the run of each pixel; or
     rays: (origins, directions) (P, 3), with first = tile order, end None.
     """
@@ -55,6 +59,7 @@ class Views:
     nodes: Any
     first: Any
     end: Any
+    offset: float = static(default=0.0)
 
     @property
     def cached(self) -> bool:
@@ -72,7 +77,7 @@ class Views:
             end = None if self.end is None else self.end[pixels]
             nodes = self.nodes if self.cached else tuple(x[pixels] for x in self.nodes)
             shapes, targets = self.shapes[which], self.targets[pixels]
-            return Views(shapes, targets, nodes, self.first[pixels], end)
+            return Views(shapes, targets, nodes, self.first[pixels], end, self.offset)
 
         return part(slice(number), slice(n)), part(slice(number, None), slice(n, None))
 
@@ -96,6 +101,7 @@ def gather_views(
     shapes = [_shape(c) for c in cameras]
     images = images_of(targets, shapes, background)
     flat = np.concatenate([x.reshape(-1, x.shape[-1]) for x in images])
+    offset = _offset_of(volume, cameras)
     traced = [isinstance(c, Segments) for c in cameras]
     if any(traced) and not cache:
         raise ValueError("cache=False renders anew, but some of the cameras are Segments.")
@@ -107,22 +113,22 @@ def gather_views(
     else:
         dtype = np.dtype(volume.points.dtype)
         if not cache:
-            nodes = _rays(cameras, dtype)
+            nodes = _rays(cameras, volume)
             return Views(shapes, flat.astype(dtype), nodes, _tile_rank(shapes), None)
         parts = list(_trace(volume, cameras, tracer, dtype))
-    first, end, offset = [], [], 0
+    first, end, before = [], [], 0
     for part, order in parts:
         start = np.asarray(part.start).astype(np.int64)
         place = np.argsort(order)  # the ray of each pixel
-        first.append(offset + start[:-1][place])
-        end.append(offset + start[1:][place])
-        offset += int(start[-1])
+        first.append(before + start[:-1][place])
+        end.append(before + start[1:][place])
+        before += int(start[-1])
     nodes = tuple(
         np.concatenate([np.asarray(getattr(p, name))[: int(p.start[-1])] for p, _ in parts])
         for name in ("scalar", "length")
     )
     first, end = np.concatenate(first), np.concatenate(end)
-    return Views(shapes, flat.astype(dtype), nodes, first, end)
+    return Views(shapes, flat.astype(dtype), nodes, first, end, offset)
 
 
 def _trace(volume: Any, cameras: list[Any], tracer: Any, dtype: Any) -> Iterator[Any]:
@@ -142,15 +148,33 @@ def _trace(volume: Any, cameras: list[Any], tracer: Any, dtype: Any) -> Iterator
         if isinstance(after, Camera) and pixels <= _TOGETHER:
             continue
         tiles = np.argsort(_tile_rank([_shape(g) for g in group]))
-        origins, directions = _rays(group, dtype)
-        part = trace(volume, (origins[tiles], directions[tiles]), tracer=tracer)
+        origins, directions = _rays(group, volume)
+        part = trace(here(volume), (origins[tiles], directions[tiles]), tracer=tracer)
         yield part, tiles[np.asarray(part.order)]
         group = []
 
 
-def _rays(cameras: list[Camera], dtype: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and directions (P, 3), computed in the volume's dtype as `render` does."""
-    rays = [jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), c).rays() for c in cameras]
+def here(volume: Any) -> Any:
+    """The volume as if its origin were that of the world: for rays that are relative to it."""
+    return dataclasses.replace(volume, origin=NOWHERE)
+
+
+def _offset_of(volume: Any, cameras: list[Any]) -> float:
+    """What the scalars of all views are relative to, or a ValueError."""
+    found = {c.offset for c in cameras if isinstance(c, Segments)}
+    if volume is not None:
+        found.add(volume.offset)
+    if len(found) > 1:
+        raise ValueError(
+            f"Scalars are relative to offsets that differ, {' and '.join(map(said, found))}: trace "
+            "all views of one volume."
+        )
+    return found.pop() if found else 0.0
+
+
+def _rays(cameras: list[Camera], volume: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions (P, 3), as `render` makes them: relative to the volume's origin."""
+    rays = [camera_of(c, volume).local_rays() for c in cameras]
     origins, directions = (
         np.concatenate([np.asarray(x).reshape(-1, 3) for x in part])
         for part in zip(*rays, strict=True)
@@ -232,6 +256,7 @@ def _runs(views: Views, pixels: np.ndarray, total: int) -> Segments:
         status=jnp.zeros(rays, jnp.int32),
         order=jnp.arange(rays, dtype=jnp.int32),
         shape=(rays,),
+        offset=views.offset,
     )
 
 

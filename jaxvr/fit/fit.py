@@ -33,7 +33,7 @@ from jaxvr.arguments import (
 )
 from jaxvr.composite import Over
 from jaxvr.defaults import diagonal
-from jaxvr.fit.batches import Batch, Views, deal, gather_views, listed, make_batches
+from jaxvr.fit.batches import Batch, Views, deal, gather_views, here, listed, make_batches
 from jaxvr.fit.belongs import belongs
 from jaxvr.fit.loop import Control, batch_number, prepare, run
 from jaxvr.fit.losses import loss_of
@@ -163,7 +163,7 @@ def fit(
     weights = [_schedule(n, w) for n, w in _weights(smoothness, smoothness_extinctions)]
     mean = jnp.mean(parameters.transfer.extinctions)
     unit = jnp.where(mean > 0, mean, 1 / size).astype(dtype)
-    fixed = parameters, unit, None if cache else volume, background
+    fixed = parameters, unit, None if cache else here(volume), background
 
     def inputs(iteration: int) -> tuple[Any, ...]:
         batch = batches[batch_number(iteration, len(batches), seed)]
@@ -198,7 +198,9 @@ def fit(
         about,
     )
     fitted = jax.tree.map(np.asarray, transfer_of(parameters, result.parameters))
-    fitted = TransferFunction(fitted.positions, fitted.colors, fitted.extinctions)
+    fitted = TransferFunction(
+        fitted.positions, fitted.colors, fitted.extinctions, offset=fitted.offset
+    )
 
     def pictures(views: Views, batches: Any, places: Any) -> list[np.ndarray]:
         flat = np.zeros((views.pixels, 4), dtype)

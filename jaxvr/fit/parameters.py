@@ -143,11 +143,13 @@ def noise(positions: Any, extinction: Any, seed: int = 0, *, dtype: Any = None) 
     expected; a few divided by the volume's diagonal is a good choice. dtype: that of positions if
     None.
     """
-    positions = np.asarray(as_floats("positions", positions, ndim=1))
+    floats = as_floats("positions", positions, ndim=1)
+    if not isinstance(positions, jax.Array):
+        positions = np.asarray(as_floats("positions", positions, dtype=np.float64))
     rng = np.random.default_rng(seed)
     colors = 1 / (1 + np.exp(-rng.standard_normal((len(positions), 3))))
     extinctions = float(extinction) * np.log1p(np.exp(rng.standard_normal(len(positions))))
-    dtype = positions.dtype if dtype is None else dtype
+    dtype = floats.dtype if dtype is None else dtype
     return TransferFunction(positions, colors, extinctions, dtype=dtype)
 
 

@@ -41,16 +41,16 @@ def move(
         low = np.nextafter(low, high)
     if index + 2 < len(x) and x[index + 2] == high:
         high = np.nextafter(high, low)
-    x[index] = min(max(x.dtype.type(position), low), high)
+    x[index] = min(max(x.dtype.type(position - transfer.offset), low), high)
     e[index] = max(extinction, 0)
-    return TransferFunction(x, colors, e, dtype=transfer.dtype)
+    return TransferFunction(x, colors, e, offset=transfer.offset)
 
 
 def add(transfer: TransferFunction, position: float, extinction: float) -> TransferFunction:
     """A new point, in the colour that is there already."""
     x, colors, e = _arrays(transfer)
     _require_finite(position, extinction)
-    position = x.dtype.type(position)
+    position = x.dtype.type(position - transfer.offset)
     while (x == position).sum() > 1:
         position = np.nextafter(position, x.dtype.type(np.inf))
     index = int(np.searchsorted(x, position, side="right"))
@@ -59,7 +59,7 @@ def add(transfer: TransferFunction, position: float, extinction: float) -> Trans
         np.insert(x, index, position),
         np.insert(colors, index, color, axis=0),
         np.insert(e, index, max(extinction, 0)),
-        dtype=transfer.dtype,
+        offset=transfer.offset,
     )
 
 
@@ -73,7 +73,7 @@ def remove(transfer: TransferFunction, index: int) -> TransferFunction:
         np.delete(x, index),
         np.delete(colors, index, axis=0),
         np.delete(e, index),
-        dtype=transfer.dtype,
+        offset=transfer.offset,
     )
 
 
@@ -84,7 +84,7 @@ def color(transfer: TransferFunction, index: int, color: str) -> TransferFunctio
     if not isinstance(color, str) or not re.fullmatch("#[0-9a-fA-F]{6}", color):
         raise ValueError(f"color must be #rrggbb, but is {color!r}.")
     colors[index] = [int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)]
-    return TransferFunction(x, colors, e, dtype=transfer.dtype)
+    return TransferFunction(x, colors, e, offset=transfer.offset)
 
 
 EDITS = {"move": move, "add": add, "remove": remove, "color": color}
@@ -108,7 +108,7 @@ def padded(transfer: TransferFunction) -> TransferFunction:
         np.concatenate([x, above]),
         np.concatenate([colors, np.repeat(colors[-1:], more, axis=0)]),
         np.concatenate([e, np.repeat(e[-1:], more)]),
-        dtype=transfer.dtype,
+        offset=transfer.offset,
     )
 
 

@@ -38,9 +38,7 @@ class Orbit:
     @staticmethod
     def of(camera: Camera, radius: float) -> Orbit:
         """The orbit that a camera is on, for a volume in a ball of that radius."""
-        eye, target, up = (
-            np.asarray(v, np.float64) for v in (camera.eye, camera.target, camera.up)
-        )
+        (eye, target), up = camera.absolute(), np.asarray(camera.up, np.float64)
         axes = orbit_axes(up)
         out = eye - target
         distance = norm(out)

@@ -204,7 +204,7 @@ class Viewer:
             "azimuth": self.orbit.azimuth,
             "elevation": self.orbit.elevation,
             "zoom": self.orbit.zoom,
-            "positions": np.asarray(t.positions, np.float64).tolist(),
+            "positions": t.absolute_positions().tolist(),
             "extinctions": np.asarray(t.extinctions, np.float64).tolist(),
             "colors": [svg.hex_color(c) for c in np.asarray(t.colors)],
         }

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxvr._core import svg
-from jaxvr._core.brief import is_known
+from jaxvr._core.brief import is_known, spanned
 
 if TYPE_CHECKING:
     from jaxvr.optics.transfer import TransferFunction
@@ -24,6 +24,9 @@ def transfer_html(transfer: TransferFunction) -> str | None:
     if not is_known(*leaves):
         return None
     x, colors, e = (np.asarray(leaf, np.float64) for leaf in leaves)
+    scalars = [f"{v + transfer.offset:.4g}" for v in x[[0, -1]]] if x.ndim == 1 and len(x) else []
+    if transfer.offset and scalars:
+        scalars = spanned(*transfer.absolute_positions()[[0, -1]]).split(" to ")
     if x.ndim != 1 or len(x) == 0 or colors.shape != (len(x), 3) or e.shape != x.shape:
         return None
     if not all(np.isfinite(a).all() for a in (x, colors, e)) or (np.diff(x) < 0).any():
@@ -53,11 +56,11 @@ def transfer_html(transfer: TransferFunction) -> str | None:
         ]
     foot = HEIGHT - 4
     if x[0] == x[-1]:
-        parts.append(svg.caption(WIDTH / 2, foot, f"{x[0]:.4g}", "middle"))
+        parts.append(svg.caption(WIDTH / 2, foot, scalars[0], "middle"))
     else:
-        parts.append(svg.caption(at[0], foot, f"{x[0]:.4g}"))
-        parts.append(svg.caption(at[-1], foot, f"{x[-1]:.4g}", "end"))
-    label = f"Transfer function of {_count(len(x))} from {x[0]:.4g} to {x[-1]:.4g}"
+        parts.append(svg.caption(at[0], foot, scalars[0]))
+        parts.append(svg.caption(at[-1], foot, scalars[1], "end"))
+    label = f"Transfer function of {_count(len(x))} from {' to '.join(scalars)}"
     return svg.picture(WIDTH, HEIGHT, parts, label)
 
 

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvr._core.brief import dtype_of, is_known, length_of
+from jaxvr._core.brief import dtype_of, is_known, length_of, spanned
 from jaxvr._core.checks import (
     as_floats,
     common_float,
@@ -26,6 +26,8 @@ from jaxvr._core.checks import (
     require_finite,
     require_shape,
 )
+from jaxvr._core.offsets import absolute, moved, offset_between, offset_of, relative, require_said
+from jaxvr._core.warn import warn
 from jaxvr.optics import colormaps
 
 Array = jax.Array
@@ -37,24 +39,39 @@ class TransferFunction:
     """A piecewise linear map from scalars to colours and extinctions, with K control points.
 
     positions (K,):   scalar values, never decreasing; two equal ones are a jump, three an error.
-        However near two others are, they are none.
+        However near two others are, they are none. Relative to `offset`.
     colors (K, 3):    linear RGB; any finite number (above 1 for lights brighter than white).
         Integers above 1 are an error, since they are taken for 8-bit colours.
     extinctions (K,): per unit of length, >= 0, any size.
 
+    offset:           what the positions are relative to; no leaf, but part of the tree's structure.
+        0 but for scalars far from 0 and close together, of which float32 would keep too few digits
+        (101325 to 101325.01): passed as plain numbers or NumPy's float64, they have one taken off.
+        `absolute_positions` puts it back. Passing `offset` says that positions are relative to it.
+
     The three share one dtype: that of the arrays passed, JAX's default float for plain numbers, or
     `dtype`. Calling the class checks everything; under `jit` and `grad`, where values are not
     known, it checks the shapes. Rebuilding from leaves (`jax.tree`) checks nothing, so gradients
-    and other trees of the same structure are TransferFunctions too.
+    and other trees of the same structure are TransferFunctions too. Warns where float32 makes two
+    positions one.
     """
 
     positions: Array
     colors: Array
     extinctions: Array
+    offset: float
 
-    def __init__(self, positions: Any, colors: Any, extinctions: Any, *, dtype: Any = None):
+    def __init__(
+        self,
+        positions: Any,
+        colors: Any,
+        extinctions: Any,
+        *,
+        offset: float | None = None,
+        dtype: Any = None,
+    ):
         dtype = common_float(dtype, positions, colors, extinctions)
-        positions = as_floats("positions", positions, ndim=1, dtype=dtype)
+        positions, offset = _less_offset(positions, offset, dtype)
         _require_unit_colors("colors", colors)
         colors = as_floats("colors", colors, ndim=2, dtype=dtype)
         extinctions = as_floats("extinctions", extinctions, ndim=1, dtype=dtype)
@@ -68,20 +85,22 @@ class TransferFunction:
         require_finite("extinctions", extinctions)
         _require_sorted(positions)
         _require_nonnegative(extinctions)
-        _set(self, jnp.asarray(positions), jnp.asarray(colors), jnp.asarray(extinctions))
+        _set(self, jnp.asarray(positions), jnp.asarray(colors), jnp.asarray(extinctions), offset)
 
     # JAX's register_dataclass would run `__init__`, and its checks, at every unflatten.
-    def tree_flatten_with_keys(self) -> tuple[tuple[tuple[Any, Any], ...], None]:
+    def tree_flatten_with_keys(self) -> tuple[tuple[tuple[Any, Any], ...], float]:
         names = ("positions", "colors", "extinctions")
-        return tuple((jax.tree_util.GetAttrKey(n), getattr(self, n)) for n in names), None
+        keyed = tuple((jax.tree_util.GetAttrKey(n), getattr(self, n)) for n in names)
+        return keyed, self.offset
 
-    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
-        return (self.positions, self.colors, self.extinctions), None
+    def tree_flatten(self) -> tuple[tuple[Any, ...], float]:
+        return (self.positions, self.colors, self.extinctions), self.offset
 
     @classmethod
-    def tree_unflatten(cls, aux: None, leaves: Any) -> TransferFunction:
+    def tree_unflatten(cls, aux: float, leaves: Any) -> TransferFunction:
         self = object.__new__(cls)
-        _set(self, *leaves)
+        positions, colors, extinctions = leaves
+        _set(self, positions, colors, extinctions, aux)
         return self
 
     @staticmethod
@@ -92,6 +111,7 @@ class TransferFunction:
         srgb: bool = False,
         *,
         points: int | None = None,
+        offset: float | None = None,
         dtype: Any = None,
     ) -> TransferFunction:
         """Control points at `positions` (K,) with colours from a colour map.
@@ -104,6 +124,7 @@ class TransferFunction:
             from sRGB first (then save pictures with `srgb=True`).
         points: add control points, so that the map is followed at this many evenly spaced positions
             beside the given ones (between control points colours are interpolated linearly).
+        offset: what positions are relative to; None for scalars as they are.
 
         Raises ValueError for an unknown name, a malformed table, or positions that are traced.
         """
@@ -116,16 +137,20 @@ class TransferFunction:
         if not isinstance(colormap, str) and not callable(colormap):
             _require_unit_colors("The colour table", colormap)
         colors = colormaps.sample(colormap, _span(positions), srgb=srgb)
-        tf = TransferFunction(positions.astype(dtype), colors.astype(dtype), extinctions)
+        tf = TransferFunction(
+            positions, colors.astype(dtype), extinctions, offset=offset, dtype=dtype
+        )
         if points is None:
             return tf
         if points < 1:
             raise ValueError(f"points must be at least 1, but is {points}.")
-        extra = np.linspace(positions[0], positions[-1], points).astype(dtype)
-        extra = extra[~np.isin(extra, positions.astype(dtype))]
-        merged = np.sort(np.concatenate([positions.astype(dtype), extra]))
+        own = np.asarray(tf.positions)
+        away = tf.offset if offset is None else 0.0  # positions are as they are, or relative
+        extra = (np.linspace(positions[0], positions[-1], points) - away).astype(dtype)
+        extra = extra[~np.isin(extra, own)]
+        merged = np.sort(np.concatenate([own, extra]))
         fine = colormaps.sample(colormap, _span(merged.astype(np.float64)), srgb=srgb)
-        return tf.resample(merged).replace(colors=fine.astype(dtype))
+        return tf._resampled(jnp.asarray(merged)).replace(colors=fine.astype(dtype))
 
     @staticmethod
     def from_opacity(
@@ -192,7 +217,8 @@ class TransferFunction:
         return self.extinctions * unit
 
     def __call__(self, scalars: Any) -> tuple[Array, Array]:
-        """Colours (..., 3) and extinctions (...) at `scalars` (...).
+        """Colours (..., 3) and extinctions (...) at `scalars` (...), as they are: with an `offset`
+        plain numbers and NumPy's float64 keep all digits.
 
         At a jump it is the upper side's value. Differentiable in the scalars and in every field:
         at a control point the derivative is that of the interval above it, outside the control
@@ -201,6 +227,8 @@ class TransferFunction:
         return self._evaluate(scalars, "right")
 
     def _evaluate(self, scalars: Any, side: str) -> tuple[Array, Array]:
+        if self.offset:
+            scalars = relative(scalars, self.offset, self.dtype)
         s = jnp.asarray(scalars)
         return _evaluate(self, s.astype(jnp.promote_types(s.dtype, self.dtype)), side)
 
@@ -210,17 +238,25 @@ class TransferFunction:
         Where `positions` names a position twice, the two get the values on either side of it, so
         jumps survive when they are named; else a jump becomes a ramp between its new neighbours.
         """
+        if self.offset:
+            positions = relative(_wide("positions", positions), self.offset, self.dtype)
         positions = as_floats("positions", positions, ndim=1, dtype=self.dtype)
         require_finite("positions", positions)
         _require_sorted(positions)
         if positions.shape[0] == 0:
             raise ValueError("resample needs at least one position, but got none.")
-        positions = jnp.asarray(positions)
-        upper_c, upper_e = self._evaluate(positions, "right")
-        lower_c, lower_e = self._evaluate(positions, "left")
+        return self._resampled(jnp.asarray(positions))
+
+    def _resampled(self, positions: Array) -> TransferFunction:
+        """`resample` at positions (M,) that are relative to the offset."""
+        upper_c, upper_e = _evaluate(self, positions, "right")
+        lower_c, lower_e = _evaluate(self, positions, "left")
         first = jnp.concatenate([positions[:-1] == positions[1:], jnp.zeros(1, bool)])
-        colors = jnp.where(first[:, None], lower_c, upper_c)
-        return TransferFunction(positions, colors, jnp.where(first, lower_e, upper_e))
+        colors, extinctions = (
+            jnp.where(first[:, None], lower_c, upper_c),
+            jnp.where(first, lower_e, upper_e),
+        )
+        return TransferFunction(positions, colors, extinctions, offset=self.offset)
 
     def with_points(self, n: int) -> TransferFunction:
         """Resampled at `n` evenly spaced control points from the first position to the last."""
@@ -229,7 +265,7 @@ class TransferFunction:
                 f"with_points needs n >= 2 and a function with at least two control points, "
                 f"but n is {n} and there are {self.positions.shape[0]}."
             )
-        return self.resample(jnp.linspace(self.positions[0], self.positions[-1], n))
+        return self._resampled(jnp.linspace(self.positions[0], self.positions[-1], n))
 
     def scaled(self, extinction_factor: Any) -> TransferFunction:
         """With all extinctions multiplied by extinction_factor (), a number >= 0."""
@@ -237,22 +273,45 @@ class TransferFunction:
         return self.replace(extinctions=self.extinctions * factor)
 
     def replace(self, **changes: Any) -> TransferFunction:
-        """With some fields changed, checked like a new one; the dtype stays."""
-        fields = {"positions", "colors", "extinctions"}
+        """With some fields changed, checked like a new one; the dtype stays.
+
+        positions: relative to `offset`; where this function has one, say `offset=` with them.
+        """
+        fields = {"positions", "colors", "extinctions", "offset"}
         if unknown := set(changes) - fields:
             raise ValueError(
                 f"A transfer function has no {sorted(unknown)}, only {sorted(fields)}."
             )
+        if "offset" in changes and "positions" not in changes:
+            raise ValueError("offset says what positions are relative to: pass positions too.")
+        if "positions" in changes and changes.get("offset") is None:
+            require_said("positions", "offset", self.offset)
+            changes["offset"] = None
         return TransferFunction(
             changes.get("positions", self.positions),
             changes.get("colors", self.colors),
             changes.get("extinctions", self.extinctions),
+            offset=changes.get("offset", self.offset),
             dtype=self.dtype,
         )
 
     def astype(self, dtype: Any) -> TransferFunction:
         """In float32 or float64."""
-        return TransferFunction(self.positions, self.colors, self.extinctions, dtype=dtype)
+        return TransferFunction(
+            self.positions, self.colors, self.extinctions, offset=self.offset, dtype=dtype
+        )
+
+    def absolute_positions(self) -> np.ndarray:
+        """The positions (K,) as scalars are, float64: with the offset. Not inside `jit`."""
+        return absolute(self.positions, self.offset)
+
+    def relative_to(self, offset: float) -> TransferFunction:
+        """The same function with its positions relative to another offset. Differentiable."""
+        offset = offset_of(offset)
+        positions = moved(self.positions, self.offset, offset, self.dtype)
+        made = object.__new__(TransferFunction)
+        _set(made, positions, self.colors, self.extinctions, offset)
+        return made
 
     @property
     def dtype(self) -> np.dtype:
@@ -264,9 +323,9 @@ class TransferFunction:
         x, e = self.positions, self.extinctions
         known = ""
         if is_known(x, e) and x.ndim == 1 and x.size and e.size:
-            x, e = np.asarray(x), np.asarray(e)
-            known = f"{x[0]:.6g} to {x[-1]:.6g}, extinction up to {e.max():.6g}, "
-        return f"TransferFunction({length_of(x)} control points, {known}{dtype_of(x)})"
+            x, e = self.absolute_positions(), np.asarray(e)
+            known = f"{spanned(x[0], x[-1])}, extinction up to {e.max():.6g}, "
+        return f"TransferFunction({length_of(x)} control points, {known}{dtype_of(self.positions)})"
 
     def _repr_html_(self) -> str | None:
         from jaxvr.optics.html import transfer_html
@@ -371,7 +430,34 @@ def _evaluate(tf: TransferFunction, s: Array, side: str) -> tuple[Array, Array]:
     return colors, below_e + t * (tf.extinctions[hi] - below_e)
 
 
-def _set(tf: TransferFunction, positions: Any, colors: Any, extinctions: Any) -> None:
+def _less_offset(positions: Any, offset: Any, dtype: Any) -> tuple[Any, float]:
+    """Positions (K,) in `dtype` and what they are relative to. See `TransferFunction`."""
+    if offset is not None:
+        return as_floats("positions", positions, ndim=1, dtype=dtype), offset_of(offset)
+    given = _wide("positions", positions)
+    if isinstance(given, jax.Array) or given.ndim != 1 or len(given) == 0:
+        return as_floats("positions", given, ndim=1, dtype=dtype), 0.0
+    ends = float(given[0]), float(given[-1])
+    away = offset_between(*ends, dtype) if np.isfinite(ends).all() else 0.0
+    with np.errstate(over="ignore"):  # infinite, and found by whoever checks
+        held = (given - away).astype(dtype)
+    if len(merged := np.flatnonzero((held[1:] == held[:-1]) & (given[1:] > given[:-1]))):
+        k = int(merged[0])
+        warn(
+            f"{len(merged)} pairs of positions are one in {np.dtype(dtype)}, and make a jump: the "
+            f"first are positions[{k}] = {given[k]:.17g} and [{k + 1}] = {given[k + 1]:.17g}.",
+            UserWarning,
+        )
+    return held, away
+
+
+def _wide(name: str, x: Any) -> Any:
+    """Floats as they come: float64 for what is not JAX's."""
+    return x if isinstance(x, jax.Array) else as_floats(name, x, dtype=np.float64)
+
+
+def _set(tf: TransferFunction, positions: Any, colors: Any, extinctions: Any, offset: Any) -> None:
+    object.__setattr__(tf, "offset", offset)
     object.__setattr__(tf, "positions", positions)
     object.__setattr__(tf, "colors", colors)
     object.__setattr__(tf, "extinctions", extinctions)

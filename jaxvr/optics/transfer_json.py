@@ -5,6 +5,8 @@ jaxvr's format holds each number with as many digits as give the same float back
     {"format": "jaxvr.TransferFunction", "version": 1, "dtype": "float64",
      "positions": [K], "colors": [[3], K times], "extinctions": [K]}
 
+and, where positions are relative to one (see `TransferFunction`), "offset".
+
 ParaView exports a list of colour maps, each with "RGBPoints" (x, r, g, b, ...), "ColorSpace" (RGB,
 HSV, Lab or CIELAB, Diverging, Step), and perhaps "Points" (x, opacity, midpoint, sharpness, ...),
 "UseLogScale" (both curves over the logarithm of x), read here as vtkColorTransferFunction and
@@ -28,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxvr._core.checks import BRIGHTEST
+from jaxvr._core.offsets import offset_between
 from jaxvr._core.warn import warn
 from jaxvr._core.writing import place_of, shown, write_whole
 from jaxvr.optics import colormaps
@@ -36,7 +39,7 @@ if TYPE_CHECKING:
     from jaxvr.optics.transfer import TransferFunction
 
 FORMAT = "jaxvr.TransferFunction"
-_KEYS = {"format", "version", "dtype", "positions", "colors", "extinctions", "brightest"}
+_KEYS = {"format", "version", "dtype", "offset", "positions", "colors", "extinctions", "brightest"}
 _READ = ("RGBPoints", "Points", "ColorSpace", "HSVWrap", "UseLogScale", "IndexedColors", "Name")
 # What ParaView calls the colour spaces of `colormaps.SPACES`.
 _SPACES = {"CIELAB": "Lab", "LAB": "Lab", "Rgb": "RGB", "Hsv": "HSV"}
@@ -52,6 +55,8 @@ def write(tf: TransferFunction, path: str | os.PathLike[str] | None = None) -> s
         "colors": np.asarray(tf.colors, np.float64).tolist(),
         "extinctions": np.asarray(tf.extinctions, np.float64).tolist(),
     }
+    if tf.offset:
+        document["offset"] = tf.offset
     brightest = max(map(max, document["colors"]))
     if brightest > BRIGHTEST:  # or `read` would take them for bytes
         document["brightest"] = brightest
@@ -104,7 +109,7 @@ def read(
     if srgb:
         colors = colormaps.srgb_to_linear(colors)
     make = _transfer_class().from_opacity
-    return make(positions, colors, opacities, unit_distance, convention, dtype=positions.dtype)
+    return make(positions, colors, opacities, unit_distance, convention, dtype=_float(dtype))
 
 
 def _transfer_class() -> type[TransferFunction]:
@@ -179,7 +184,11 @@ def _own(document: dict[str, Any], dtype: Any) -> TransferFunction:
     if isinstance(stated, bool) or not isinstance(stated, int | float):
         raise ValueError(f"'brightest' must be a number, but is {stated!r}.")
     _require_light("colors", arrays[1], 1 if whole else max(BRIGHTEST, stated))
-    return _transfer_class()(*arrays, dtype=stored if dtype is None else dtype)
+    offset = _numbers(document, "offset") if "offset" in document else None
+    if offset is not None and offset.ndim:
+        raise ValueError(f"'offset' must be one number, but is {document['offset']!r}.")
+    away = None if offset is None else float(offset)
+    return _transfer_class()(*arrays, offset=away, dtype=stored if dtype is None else dtype)
 
 
 def _numbers(document: dict[str, Any], key: str) -> np.ndarray:
@@ -276,6 +285,9 @@ def sample_curves(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Control points that follow both curves: positions, colours, opacities.
 
+    Positions are float64, but numbers that `dtype` holds, less the offset that a `TransferFunction`
+    takes off.
+
     nodes (n, 6): x, r, g, b, midpoint, sharpness of vtkColorTransferFunction; space: of `SPACES`.
     curve (m, 4): x, opacity, midpoint, sharpness of vtkPiecewiseFunction. Both ascend by x, and two
     nodes at one x are a jump. points, dtype: as in `read`. logarithmic: the curves are those over
@@ -313,7 +325,9 @@ def sample_curves(
     if logarithmic:
         positions = _powers(positions, places)
     order = np.argsort(positions, kind="stable")  # at a jump the lower side comes first
-    positions, values = positions[order].astype(_float(dtype)), values[order]
+    positions, values = positions[order], values[order]
+    away = offset_between(float(positions[0]), float(positions[-1]), _float(dtype))
+    positions = (positions - away).astype(_float(dtype)).astype(np.float64) + away
     # Rounded to float32, neighbours may have become equal: a run keeps its first and its last.
     run = np.concatenate([[False], positions[1:] == positions[:-1]])
     inner = run & np.concatenate([run[1:], [False]])

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxvr._core.checks import default_float, float_dtype
 from jaxvr.optics.transfer_json import sample_curves
 
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ def read(
     curve[:, 1] /= top
     positions, colors, opacities = sample_curves(nodes, space, curve, points, dtype)
     make = TransferFunction.from_opacity
-    return make(positions, colors, opacities, unit / top, convention, dtype=positions.dtype)
+    dtype = default_float() if dtype is None else float_dtype(dtype)
+    return make(positions, colors, opacities, unit / top, convention, dtype=dtype)
 
 
 def write(tf: TransferFunction, unit_distance: float = 1.0) -> tuple[Any, Any]:
@@ -63,7 +65,7 @@ def write(tf: TransferFunction, unit_distance: float = 1.0) -> tuple[Any, Any]:
     except ImportError as e:
         raise ImportError("to_vtk needs VTK: pip install vtk") from e
     x, colors, extinctions = (
-        np.asarray(a, np.float64) for a in (tf.positions, tf.colors, tf.extinctions)
+        np.asarray(a, np.float64) for a in (tf.absolute_positions(), tf.colors, tf.extinctions)
     )
     if not 0 < unit_distance < math.inf:
         raise ValueError(f"unit_distance must be a length above 0, but is {unit_distance}.")

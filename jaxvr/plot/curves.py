@@ -40,7 +40,7 @@ def transfer(
     for f in both:
         _require_transfer(f)
     data = None if values is None else _scalars(values)
-    ends = [f.positions[k] for f in both for k in (0, -1)]
+    ends = [f.absolute_positions()[k] for f in both for k in (0, -1)]
     ends += [] if data is None else [data.min(), data.max()]
     lo, hi = float(min(ends)), float(max(ends))
     margin = 0.03 * (hi - lo) or 0.5
@@ -57,7 +57,7 @@ def transfer(
         strip.set_clip_path(band.get_paths()[0], ax.transData)
     ax.plot(x, y, color=color, linewidth=1.2, label="transfer function")
     if len(tf.positions) <= MARKED:
-        ax.plot(tf.positions, tf.extinctions, "o", color=color, markersize=3)
+        ax.plot(tf.absolute_positions(), tf.extinctions, "o", color=color, markersize=3)
     room = top
     if reference is not None:
         outline = _outline(reference, lo, hi)
@@ -110,7 +110,7 @@ def transfer_gradient(
     right, color = ax.twinx(), ink(ax)
     color_as(right, color)
     right.grid(False)
-    x, mark = np.asarray(tf.positions, np.float64), "o" if k <= MARKED else ""
+    x, mark = tf.absolute_positions(), "o" if k <= MARKED else ""
     ax.axhline(0, color=color, linewidth=0.8)
     bars = ax.vlines(x, 0, extinctions, color=color, linewidth=2.5, alpha=0.55, label="extinction")
     lines = [
@@ -207,7 +207,7 @@ def _require_transfer(tf: Any) -> None:
 
 def _outline(tf: TransferFunction, lo: float, hi: float) -> tuple[np.ndarray, np.ndarray]:
     """The graph as a polyline with its jumps upright, carried on to lo and hi."""
-    x, y = np.asarray(tf.positions, np.float64), np.asarray(tf.extinctions, np.float64)
+    x, y = tf.absolute_positions(), np.asarray(tf.extinctions, np.float64)
     return np.concatenate([[lo], x, [hi]]), np.concatenate([y[:1], y, y[-1:]])
 
 

@@ -194,7 +194,7 @@ def _transfer_bar(
     ax: Axes, transfer: TransferFunction, label: str, background: Any, srgb: bool
 ) -> None:
     """The colours of a transfer function from bottom to top, beside a picture."""
-    lo, hi = (float(transfer.positions[k]) for k in (0, -1))
+    lo, hi = transfer.absolute_positions()[[0, -1]].tolist()
     margin = 0 if hi > lo else 0.5
     lo, hi = lo - margin, hi + margin
     s = lo + (np.arange(512)[::-1] + 0.5) / 512 * (hi - lo)

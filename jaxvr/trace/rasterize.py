@@ -26,6 +26,7 @@ from jaxvr._core.checks import (
     require_shape,
 )
 from jaxvr._core.gather import take
+from jaxvr._core.offsets import require_said
 from jaxvr._core.pytree import pytree, static
 from jaxvr._core.units import require_lengths
 from jaxvr.order import AbstractOrder, Centroid
@@ -83,10 +84,12 @@ class Fragments:
     width: int = static(default=0)
     height: int = static(default=0)
 
-    def locate(self, points: Any, values: Any, camera: Camera) -> tuple[Array, Array]:
+    def locate(
+        self, points: Any, values: Any, camera: Camera, *, origin: Any = None
+    ) -> tuple[Array, Array]:
         """depth (N,) and scalar (N,) anew, with fragments held fixed: differentiable in points
         (P, 3), values (P,) and the camera, in both modes. Rays that lie in a triangle's plane have
-        no derivative across it.
+        no derivative across it. origin: as for `rasterize`.
 
         Raises:
           ValueError: if the camera's image has another size.
@@ -97,6 +100,7 @@ class Fragments:
                 f"The fragments are of an image of {self.height} x {self.width} pixels, but the "
                 f"camera's has {size[0]} x {size[1]}."
             )
+        points, camera = _beside(points, camera, origin)
         return _locate(self, jnp.asarray(points), jnp.asarray(values), camera)
 
 
@@ -107,13 +111,16 @@ def rasterize(
     values: Any = None,
     *,
     order: AbstractOrder | None = None,
+    origin: Any = None,
 ) -> Fragments:
     """All fragments of triangles in an image.
 
     Args:
       points (P, 3): in world units. triangles (F, 3): point ids, of either winding. values (P,):
         scalars, 0 if None. camera: its pixel centres are sampled. order: in which triangles are
-        drawn; `jaxvr.order.Centroid()` if None.
+        drawn; `jaxvr.order.Centroid()` if None. origin (3,): what points are relative to, which is
+        `mesh.origin` for those of a mesh; None for the world. To be said of JAX's arrays where the
+        camera has an origin.
 
     Returns:
       `Fragments`, in front of the camera only, in the widest float type of points and values.
@@ -135,6 +142,7 @@ def rasterize(
             "shape of its result. Call it outside, and Fragments.locate inside."
         )
     require_kind("camera", camera, Camera)
+    points, camera = _beside(points, camera, origin)
     dtype = common_float(None, *(np.asarray(x) for x in (points, values) if x is not None))
     points = as_floats("points", points, ndim=2, dtype=dtype)
     require_shape("points", points, (None, 3))
@@ -150,7 +158,7 @@ def rasterize(
     sort = Sort(order or Centroid())
     # Rays and not the camera: one compiled function for all kinds of them.
     order_of = tile_order(camera.height, camera.width)
-    rays = tuple(x.reshape(-1, 3)[order_of] for x in camera.rays())
+    rays = tuple(x.reshape(-1, 3)[order_of] for x in camera.local_rays())
     counts = np.asarray(_count(sort, source, rays))
     start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     total = int(start[-1])
@@ -260,10 +268,21 @@ def _fill(sort: Sort, source: Triangles, rays: Any, start: Array, room: int) -> 
     return lax.scan(one, nothing, (origins, directions, start))[0]
 
 
+def _beside(points: Any, camera: Camera, origin: Any) -> tuple[Any, Camera]:
+    """Points and camera relative to one origin."""
+    if origin is not None:
+        return points, camera.relative_to(origin)
+    if not any(camera.origin):
+        return points, camera
+    if isinstance(points, jax.Array):
+        require_said("points", "origin", camera.origin)
+    return as_floats("points", points, dtype=np.float64) - camera.origin, camera
+
+
 @jax.jit
 def _locate(fragments: Fragments, points: Array, values: Array, camera: Camera) -> Any:
     source = triangle_source(points, values, fragments.triangles)
-    origins, directions = (x.reshape(-1, 3)[fragments.pixel] for x in camera.rays())
+    origins, directions = (x.reshape(-1, 3)[fragments.pixel] for x in camera.local_rays())
     rays = shear_rays(origins, directions, source.scale)
     wanted = jnp.ones((), bool)
     face = face_at(source, rays, fragments.face, wanted)

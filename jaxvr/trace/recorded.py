@@ -33,7 +33,8 @@ class Segments:
 
     scalar (N,), length (N,): nodes, ray after ray. start (R + 1,) int32: each ray's run.
     status (R,) int32. order (R,) int32: place of each ray in the image, row by row.
-    shape: shape of the image, (height, width), or that of the rays.
+    shape: shape of the image, (height, width), or that of the rays. offset: what scalar is relative
+    to, that of the mesh.
     """
 
     scalar: Array
@@ -42,6 +43,7 @@ class Segments:
     status: Array
     order: Array
     shape: tuple[int, ...] = static(default=())
+    offset: float = static(default=0.0)
 
     @property
     def count(self) -> int:

@@ -30,6 +30,16 @@ from jaxvr._core.checks import (
     require_finite,
     require_shape,
 )
+from jaxvr._core.offsets import (
+    NOWHERE,
+    Origin,
+    absolute,
+    offset_between,
+    origin_of,
+    require_said,
+    said,
+)
+from jaxvr._core.offsets import moved as moved_to
 from jaxvr._core.pytree import pytree, static
 from jaxvr._core.stage import stage
 from jaxvr._core.units import near_one
@@ -41,7 +51,8 @@ class HasBounds(Protocol):
     """Anything that a camera can orbit."""
 
     def bounds(self) -> tuple[Any, Any]:
-        """The lower and the upper corner (3,), (3,) of the axis-aligned bounding box."""
+        """The lower and the upper corner (3,), (3,) of the axis-aligned bounding box; relative to
+        `origin`, where there is such an attribute."""
         ...
 
 
@@ -49,12 +60,15 @@ class HasBounds(Protocol):
 class Camera:
     """A view of the world. Make one with `look_at`, `orthographic`, `orbit` or `sphere`.
 
-    eye (3,):     where the camera stands, in world units.
-    target (3,):  a point in the middle of the picture.
+    eye (3,):     where the camera stands, in world units, relative to `origin`.
+    target (3,):  a point in the middle of the picture, relative to `origin`.
     up (3,):      the direction that points up in the picture; need not be perpendicular or unit.
     fov ():       full vertical angle in degrees of a pinhole camera, else None.
     extent ():    full vertical height in world units of an orthographic camera, else None.
     width, height: pixels; part of the tree's structure.
+    origin (3,):  plain numbers, part of the structure. 0 but in float32 for a target that lies far
+        from 0 beside the eye's distance: given as plain numbers or NumPy's float64 the two have it
+        taken off before they are rounded. `orbit` takes that of the volume.
 
     The arrays share one dtype, which is that of the rays. The rays are differentiable in eye,
     target, up and fov or extent. The factories and `replace` check their arguments (values only
@@ -68,6 +82,7 @@ class Camera:
     extent: Array | None
     width: int = static(default=512)
     height: int = static(default=512)
+    origin: Origin = static(default=NOWHERE)
 
     @staticmethod
     def look_at(
@@ -154,7 +169,8 @@ class Camera:
             x, y, z = (jnp.asarray(axis, dtype) for axis in axes)
             outward = outward[0] * x + outward[1] * y + outward[2] * z
         eye = target + distance * outward
-        return _make(eye, target, up, angle, None, width, height, dtype)
+        origin = getattr(volume, "origin", NOWHERE)
+        return _make(eye, target, up, angle, None, width, height, dtype, origin)
 
     @staticmethod
     def sphere(
@@ -227,13 +243,16 @@ class Camera:
         # leaves may be tracers or placeholders
         kind = "extent" if self.fov is None else "fov"
         parts = ", ".join(f"{n}={brief(getattr(self, n))}" for n in ("eye", "target", "up", kind))
-        return f"Camera({parts}, {self.width} x {self.height} pixels, {dtype_of(self.eye)})"
+        where = f"relative to {said(self.origin)}, " if any(self.origin) else ""
+        size = f"{self.width} x {self.height} pixels"
+        return f"Camera({parts}, {where}{size}, {dtype_of(self.eye)})"
 
     def replace(self, **changes: Any) -> Camera:
         """This camera with some fields changed, checked as the factories do.
 
         Passing `fov` to an orthographic camera, or `extent` to a pinhole, turns it into the other
-        kind. The dtype stays.
+        kind. The dtype stays. eye and target are relative to `origin`; where the camera has one,
+        say `origin=` with them.
         """
         names = {f.name for f in dataclasses.fields(self)}
         if unknown := set(changes) - names:
@@ -243,8 +262,30 @@ class Camera:
             old["extent"] = None
         elif changes.get("extent") is not None:
             old["fov"] = None
-        new = old | changes
+        moved = [name for name in ("eye", "target") if name in changes]
+        if "origin" in changes and not moved:
+            raise ValueError("origin says what eye and target are relative to: pass them too.")
+        if moved and changes.get("origin") is None:
+            require_said(" and ".join(moved), "origin", self.origin)
+            changes["origin"] = self.origin
+        origin = origin_of(changes.get("origin", self.origin))
+        for name in ("eye", "target"):
+            if name not in changes:
+                old[name] = moved_to(old[name], self.origin, origin, self.dtype)
+        new = old | changes | {"origin": origin}
         return _make(**new, dtype=self.dtype)
+
+    def relative_to(self, origin: Any) -> Camera:
+        """The same view with eye and target relative to another origin (3,). Differentiable."""
+        origin = origin_of(origin)
+        eye, target = (
+            moved_to(x, self.origin, origin, self.dtype) for x in (self.eye, self.target)
+        )
+        return dataclasses.replace(self, eye=eye, target=target, origin=origin)
+
+    def absolute(self) -> tuple[np.ndarray, np.ndarray]:
+        """eye and target (3,), (3,) in the world, float64. Not inside `jit`."""
+        return absolute(self.eye, self.origin), absolute(self.target, self.origin)
 
     def basis(self) -> tuple[Array, Array, Array]:
         """The unit vectors right, true_up and forward, (3,) each."""
@@ -260,7 +301,22 @@ class Camera:
         The same bits inside of any `jit` and outside: what XLA fuses decides which products and
         sums are rounded once, so rays are made in kernels of their own (see `_core.stage`). Those
         of a camera whose eye is NaN have no direction, and are told as lost.
+
+        In the world: with an `origin` the origins are NumPy's float64, since float32 would not keep
+        them. Raises ValueError for such a camera inside `jit`: there render with the camera.
         """
+        origins, directions = self.local_rays()
+        if not any(self.origin):
+            return origins, directions
+        if not is_concrete(origins):
+            raise ValueError(
+                f"The rays of a camera far from 0, relative to {said(self.origin)}, cannot be made "
+                "in float32 inside jit. Render with the camera, or turn on x64."
+            )
+        return absolute(origins, self.origin), directions  # type: ignore[return-value]
+
+    def local_rays(self) -> tuple[Array, Array]:
+        """`rays` whose origins are relative to `origin`, in the camera's dtype."""
         return _rays(self)
 
 
@@ -322,9 +378,20 @@ def _bounds_of(volume: Any) -> tuple[Any, Any]:
 
 
 def _make(
-    eye: Any, target: Any, up: Any, fov: Any, extent: Any, width: Any, height: Any, dtype: Any
+    eye: Any,
+    target: Any,
+    up: Any,
+    fov: Any,
+    extent: Any,
+    width: Any,
+    height: Any,
+    dtype: Any,
+    origin: Origin | None = None,
 ) -> Camera:
+    """origin: what eye and target are relative to; None for the world, where they may get one."""
     dtype = common_float(dtype, eye, target, up)
+    if origin is None:
+        eye, target, origin = _less_origin(eye, target, dtype)
     eye, target, up = (_vector(*v, dtype) for v in (("eye", eye), ("target", target), ("up", up)))
     if fov is not None and extent is not None:
         raise ValueError("A camera has a fov (pinhole) or an extent (orthographic), not both.")
@@ -339,8 +406,22 @@ def _make(
     _require_view(eye, target, up, dtype)
     width, height = _positive("width", width), _positive("height", height)
     return Camera(
-        jnp.asarray(eye), jnp.asarray(target), jnp.asarray(up), fov, extent, width, height
+        jnp.asarray(eye), jnp.asarray(target), jnp.asarray(up), fov, extent, width, height, origin
     )
+
+
+def _less_origin(eye: Any, target: Any, dtype: Any) -> tuple[Any, Any, Origin]:
+    """Eye and target relative to an origin near the target, where they are far from 0 beside the
+    distance from one to the other, and are not JAX's."""
+    if isinstance(eye, jax.Array) or isinstance(target, jax.Array):
+        return eye, target, NOWHERE
+    wide = [as_floats(n, x, dtype=np.float64) for n, x in (("eye", eye), ("target", target))]
+    if any(x.shape != (3,) or not np.isfinite(x).all() for x in wide):
+        return eye, target, NOWHERE  # said by whoever checks
+    far = float(np.abs(wide[1] - wide[0]).max())
+    x, y, z = (offset_between(float(t), float(t), dtype, far) for t in wide[1])
+    origin = (x, y, z)
+    return wide[0] - origin, wide[1] - origin, origin
 
 
 def _vector(name: str, x: Any, dtype: Any) -> Any:

@@ -52,8 +52,9 @@ def write(camera: Camera, into: Any = None) -> Any:
             raise ImportError("to_vtk needs VTK: pip install vtk") from e
         into = vtkCamera()
     view = _view(into)
-    view.SetPosition(*np.asarray(camera.eye, float).tolist())
-    view.SetFocalPoint(*np.asarray(camera.target, float).tolist())
+    eye, target = camera.absolute()
+    view.SetPosition(*eye.tolist())
+    view.SetFocalPoint(*target.tolist())
     view.SetViewUp(*np.asarray(camera.up, float).tolist())
     view.SetUseHorizontalViewAngle(0)
     view.SetParallelProjection(camera.fov is None)

@@ -20,9 +20,11 @@ import jax
 import numpy as np
 
 from .._core.checks import as_floats, default_float, float_dtype, is_concrete, require_finite
+from .._core.offsets import NOWHERE, Origin, offset_between
 from .._core.units import scaled_to_one
 from . import cells as zoo
 from . import connectivity as conn
+from .digits import coarse_cells
 from .geometry import flat_cells, signed_volumes
 from .packing import MAX_CELLS
 from .report import MeshReport, collapse
@@ -81,8 +83,8 @@ def mesh_dtype(points: Any, dtype: Any) -> np.dtype:
     return want
 
 
-def floats(name: str, x: Any, dtype: np.dtype) -> np.ndarray:
-    """x as a finite NumPy array of this dtype, or a ValueError that names it."""
+def numbers(name: str, x: Any) -> np.ndarray:
+    """x as a finite NumPy array of float64, or a ValueError that names it."""
     if not is_concrete(x):
         raise ValueError(
             f"{name} is traced, but building a mesh finds integers from its values. Build the mesh "
@@ -90,6 +92,11 @@ def floats(name: str, x: Any, dtype: np.dtype) -> np.ndarray:
         )
     array = as_floats(name, np.asarray(x) if isinstance(x, jax.Array) else x, dtype=np.float64)
     require_finite(name, array)
+    return array
+
+
+def cast(name: str, array: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Finite float64 numbers in this dtype, or a ValueError that names them."""
     with np.errstate(over="ignore", under="ignore"):
         out = array.astype(dtype)
     if not np.isfinite(out).all():
@@ -100,13 +107,24 @@ def floats(name: str, x: Any, dtype: np.dtype) -> np.ndarray:
     return out
 
 
-def read_points(points: Any, dtype: Any) -> np.ndarray:
-    out = floats("points", points, mesh_dtype(points, dtype))
+def read_points(points: Any) -> np.ndarray:
+    """(P, 3) float64."""
+    out = numbers("points", points)
     if out.ndim != 2 or out.shape[1] != 3:
         raise ValueError(f"points must have shape (P, 3), but has {out.shape}.")
     if len(out) == 0:
         raise ValueError("The mesh is empty: points has shape (0, 3).")
     return out
+
+
+def origin_for(points: np.ndarray, blocks: list[Block], dtype: np.dtype) -> Origin:
+    """What to hold points (P, 3) relative to (see `offsets`), by those that cells use."""
+    used = np.zeros(len(points), bool)
+    for b in blocks:
+        used[b.corners] = True
+    low, high = points[used].min(axis=0), points[used].max(axis=0)
+    x, y, z = (offset_between(float(a), float(b), dtype) for a, b in zip(low, high, strict=True))
+    return x, y, z
 
 
 def read_indices(name: str, x: Any, nodes: int | None, corners: int, n_points: int) -> np.ndarray:
@@ -186,6 +204,7 @@ class Built:
     all_tetra: bool
     block_sizes: tuple[tuple[str, int], ...]
     report: MeshReport
+    origin: Origin = NOWHERE  # the points are relative to it
     mixed: int = 0  # cells of the zoo that lie the other way round than most of their type
 
 
@@ -278,10 +297,19 @@ def _match(welded_rows: np.ndarray, parent: np.ndarray, blocks: list[Block]) -> 
         ) from None
 
 
-def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Built:
-    """Everything but the values. Raises ValueError as `TetMesh.from_cells` says."""
-    pts = read_points(points, dtype)
-    blocks, reduced, ignored = read_blocks(cells, len(pts))
+def build(
+    points: Any, cells: Any, dtype: Any, field: str | None = None, origin: Origin | None = None
+) -> Built:
+    """Everything but the values. Raises ValueError as `TetMesh.from_cells` says.
+
+    origin: what the points are relative to; None for points as they are, which may get one.
+    """
+    kind, exact = mesh_dtype(points, dtype), read_points(points)
+    blocks, reduced, ignored = read_blocks(cells, len(exact))
+    if origin is None:
+        origin = origin_for(exact, blocks, kind)
+        exact = exact - np.asarray(origin)
+    pts = cast("points", exact, kind)
     welded, duplicates = weld(pts)
 
     tets, parent, sizes, sign, start = [], [], [], [], 0
@@ -304,7 +332,7 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
     t, p, volume, s = (np.concatenate(x) for x in (tets, parent, sizes, sign))
     made, repeats = len(t), _repeats(welded, t)
     flat = flat_cells(pts, t) | (s == 0)
-    collapsed = _collapsed(points, pts, t[flat | repeats]) if flat.any() or repeats.any() else 0
+    collapsed = _collapsed(exact, pts, t[flat | repeats]) if flat.any() or repeats.any() else 0
     if not (s[~repeats] != 0).any():
         advice = f" {collapse(collapsed)}" if collapsed else ""
         raise ValueError(
@@ -350,6 +378,7 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
         duplicate_points=len(duplicates),
         one_sided=one_sided,
         field=field,
+        coarse=coarse_cells(points, exact, pts, np.asarray(origin), rows),
     )
     return Built(
         points=pts,
@@ -363,6 +392,7 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
         all_tetra=all(b.kind is zoo.TETRA for b in blocks if len(b.corners)),
         block_sizes=tuple((b.name, len(b.corners)) for b in blocks),
         report=report,
+        origin=origin,
         mixed=sum(min(up, down) for _, up, down in zoo_signs),
     )
 

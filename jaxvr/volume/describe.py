@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .._core.brief import spanned
+from .._core.offsets import said
 from .connectivity import components
 from .packing import cell_of
 from .quality import quality
@@ -27,8 +29,19 @@ def count_components(neighbors: Any) -> tuple[int, int]:
     return count, int(np.bincount(label).max())
 
 
-def _triple(x: Any) -> str:
-    return "(" + ", ".join(f"{float(v):.6g}" for v in x) + ")"
+def _triple(x: Any, mesh: TetMesh) -> str:
+    """A place relative to the mesh's origin, in the world."""
+    parts = zip(np.asarray(x, np.float64), mesh.origin, strict=True)
+    return "(" + ", ".join(f"{v + o:.10g}" if o else f"{v:.6g}" for v, o in parts) + ")"
+
+
+def offsets(mesh: TetMesh) -> list[tuple[str, str]]:
+    """What points and values are held relative to, where they are."""
+    rows = (
+        ("origin", f"{said(mesh.origin)}: points are held relative to it", any(mesh.origin)),
+        ("offset", f"{said(mesh.offset)}: values are held relative to it", bool(mesh.offset)),
+    )
+    return [(label, text) for label, text, there in rows if there]
 
 
 def _size(n: int) -> str:
@@ -52,11 +65,12 @@ def describe(mesh: TetMesh) -> str:
         *mesh.report.lines(),
         ("components", shape),
         ("boundary", f"{mesh.n_boundary:,} faces"),
-        ("box", f"{_triple(lo)} to {_triple(hi)}"),
+        ("box", f"{_triple(lo, mesh)} to {_triple(hi, mesh)}"),
+        *offsets(mesh),
         ("dihedral angles", f"{q.min_dihedral:.3g} to {q.max_dihedral:.6g} degrees"),
         ("edge ratio", f"up to {q.edge_ratio:,.4g}"),
         ("volumes", f"{q.min_volume:.3g} to {q.max_volume:.3g}, {q.volume:.6g} in all"),
-        ("field", f"{field}, {mesh.location} data, {low:.6g} to {high:.6g}"),
+        ("field", f"{field}, {mesh.location} data, {spanned(low, high)}"),
         ("memory", f"{_size(nbytes)}, {nbytes / mesh.n_tets:.0f} bytes per tetrahedron"),
     ]
     width = max(len(label) for label, _ in rows)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._core import svg
-from .._core.brief import is_known
-from .describe import _size, _triple
+from .._core.brief import is_known, spanned
+from .describe import _size, _triple, offsets
 from .statistics import used_points, used_values
 
 if TYPE_CHECKING:
@@ -36,8 +36,9 @@ def mesh_html(mesh: TetMesh) -> str | None:
     rows = [
         ("tetrahedra", f"{mesh.n_tets:,}"),
         ("points", f"{mesh.n_points:,}"),
-        ("field", f"{name}, {mesh.location} data, {low:.6g} to {high:.6g}"),
-        ("box", f"{_triple(corners.min(0))} to {_triple(corners.max(0))}"),
+        ("field", f"{name}, {mesh.location} data, {spanned(low, high)}"),
+        ("box", f"{_triple(corners.min(0), mesh)} to {_triple(corners.max(0), mesh)}"),
+        *offsets(mesh),
         ("dtype", str(mesh.dtype)),
         *mesh.report.lines(),
         ("memory", _size(mesh.nbytes)),

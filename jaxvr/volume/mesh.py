@@ -12,12 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.checks import as_floats, is_concrete, require_finite, require_shape
+from .._core.offsets import (
+    NOWHERE,
+    Origin,
+    absolute,
+    offset_between,
+    offset_of,
+    origin_of,
+    require_said,
+    said,
+)
 from .._core.pytree import pytree, static
 from .build import build, require_sound
+from .digits import lost_values
 from .integrity import require_connectivity, trust, trust_entries
 from .mirror import mirrored
 from .report import MeshReport
-from .values import choose_location, place, rounded
+from .statistics import used_points
+from .values import choose_location, offset_for, place, rounded
 
 Array = jax.Array
 
@@ -26,9 +38,9 @@ Array = jax.Array
 class TetMesh:
     """Tetrahedra with a scalar field. Make one with `TetMesh.from_cells` or `jaxvr.read_mesh`.
 
-    points (P, 3): as given; points that coincide are kept apart.
-    values (P,), (T,) or (T, 4): by `location`, "point", "cell" or "corner" (the corners in the
-        order of `cells`); the dtype is that of points.
+    points (P, 3): relative to `origin`; points that coincide are kept apart.
+    values (P,), (T,) or (T, 4): relative to `offset`; by `location`, "point", "cell" or "corner"
+        (the corners in the order of `cells`); the dtype is that of points.
     cells (T, 4) int32: point ids. Each row is sorted by *welded* id, the smallest index among
         points that coincide exactly; the four are distinct. So a face that two cells share lists
         its vertices in the same order in both, and rows are not sorted by orientation.
@@ -42,6 +54,11 @@ class TetMesh:
         q3 - q0) > 0, else -1, and sigma = tau if f is odd else -tau. In Morton order.
     duplicates (n, 2) int32: every point that coincides with an earlier one, and its welded id.
     location, report: static.
+    origin (3,), offset: plain numbers, static. 0 but in float32 for points, or values, far from 0
+        and close together, of which it would keep too few digits (coordinates in a national grid,
+        101325 Pa and a few more): these are taken off in float64 before anything is rounded.
+        `absolute_points` and `absolute_values` put them back; cameras, rays, transfer functions
+        and probes take and give the world's numbers, and know of both.
 
     A cell is turned if its geometric orientation contradicts that of its neighbours, so that it
     overlaps them (a fold, as in a crushed mesh). The bit says how the cell lies in the mesh *as it
@@ -61,6 +78,8 @@ class TetMesh:
     duplicates: Array
     location: str = static(default="point")
     report: MeshReport = static(default=MeshReport())
+    origin: Origin = static(default=NOWHERE)
+    offset: float = static(default=0.0)
 
     @classmethod
     def from_cells(
@@ -93,7 +112,8 @@ class TetMesh:
         infinite numbers, an unknown cell type, cells that are mostly twisted as their nodes are in
         another order, faces with three or more cells, cells given twice, values that fit nothing or
         more than one location, and where no cells are left. Warns of integer values that float32
-        cannot hold.
+        cannot hold, and of points and values of which it keeps too few digits in spite of an
+        `origin` and an `offset`.
         """
         return _from_cells(cls, points, cells, values, location, dtype, None, stacklevel=3)
 
@@ -125,12 +145,23 @@ class TetMesh:
 
         return write_grid(self)
 
-    def replace(self, *, values: Any = None, points: Any = None, location: Any = None) -> TetMesh:
+    def replace(
+        self,
+        *,
+        values: Any = None,
+        points: Any = None,
+        location: Any = None,
+        origin: Any = None,
+        offset: Any = None,
+    ) -> TetMesh:
         """The same connectivity with new floats; works under `jit` and `grad`.
 
         values: of the shape of any location, (P,), (T,) or (T, 4); where two fit, the present
         location is kept, or `location` says which. points (P, 3): see the class on what may move.
-        Both are cast to the dtype of the points. Raises ValueError for other shapes and, outside
+        Both are cast to the dtype of the points. origin, offset: what the new points, or values,
+        are relative to: 0 for numbers as they are, `mesh.origin` or `mesh.offset` for what was made
+        of the mesh's own. To be said where the mesh has one; else NumPy's float64 may get an offset
+        as in `from_cells`. Raises ValueError for other shapes and, outside
         tracing, for NaN or infinite entries.
 
         Points that mirror the mesh (an axis with another sign, two axes swapped), or a part of it
@@ -142,7 +173,7 @@ class TetMesh:
         new: dict[str, Any] = {}
         looked = False
         if points is not None:
-            new["points"] = self._floats("points", points)
+            new["points"], new["origin"] = self._points(points, origin)
             require_shape("points", new["points"], self.points.shape)
             if is_concrete(new["points"], self.cells, self.neighbors, self.boundary):
                 require_connectivity(self)
@@ -153,7 +184,7 @@ class TetMesh:
                 if message:
                     warnings.warn(message, UserWarning, stacklevel=2)
         if values is not None:
-            v = self._floats("values", values)
+            v, new["offset"] = self._values(values, offset)
             sizes = {"point": (self.n_points,), "cell": (self.n_tets,), "corner": self.cells.shape}
             if location is None and v.shape == sizes[self.location]:
                 location = self.location
@@ -161,16 +192,67 @@ class TetMesh:
             new["location"] = choose_location(v.shape, sizes, location)
         elif location is not None:
             raise ValueError("location says where values live: pass values too.")
+        for name, of in (("origin", points), ("offset", values)):
+            if of is None and {"origin": origin, "offset": offset}[name] is not None:
+                numbers = "points" if name == "origin" else "values"
+                raise ValueError(f"{name} says what {numbers} are relative to: pass {numbers} too.")
         changed = dataclasses.replace(self, **new)
         return trust_entries(changed) if looked else changed
+
+    def _points(self, points: Any, origin: Any) -> tuple[Array, Origin]:
+        """New points as they are held, and what they are relative to."""
+        if origin is None:
+            require_said("points", "origin", self.origin)
+        place = NOWHERE if origin is None else origin_of(origin)
+        if origin is None and not isinstance(points, jax.Array):
+            points = as_floats("points", points, dtype=np.float64)
+            if points.shape == self.points.shape and is_concrete(self.cells):
+                cells = np.asarray(self.cells)
+                low, high = points[cells].min((0, 1)), points[cells].max((0, 1))
+                x, y, z = (
+                    offset_between(float(a), float(b), self.dtype)
+                    for a, b in zip(low, high, strict=True)
+                )
+                place, points = (x, y, z), points - (x, y, z)
+        return self._floats("points", points), place
+
+    def _values(self, values: Any, offset: Any) -> tuple[Array, float]:
+        """New values as they are held, and what they are relative to."""
+        if offset is not None:
+            return self._floats("values", values), offset_of(offset)
+        require_said("values", "offset", self.offset)
+        away = 0.0
+        if not isinstance(values, jax.Array):
+            exact = as_floats("values", values, dtype=np.float64)
+            used = exact.reshape(-1)
+            if used.size and np.isfinite(used).all():
+                if exact.shape == (self.n_points,) and is_concrete(self.cells):
+                    used = exact[used_points(self)]
+                away = offset_for(values, used, self.dtype)
+            for message in (
+                rounded("values", values, self.dtype, away),
+                lost_values(values, used, away, self.dtype) if away else None,
+            ):
+                if message:
+                    warnings.warn(message, UserWarning, stacklevel=3)
+            values = exact - away
+        elif message := rounded("values", values, self.dtype):
+            warnings.warn(message, UserWarning, stacklevel=3)
+        return self._floats("values", values), away
 
     def _floats(self, name: str, x: Any) -> Array:
         with np.errstate(over="ignore"):  # too large for the dtype is infinite, and found below
             out = as_floats(name, x, dtype=self.points.dtype)
         require_finite(name, out)  # looks only where the numbers are known
-        if name == "values" and (message := rounded(name, x, self.dtype)):
-            warnings.warn(message, UserWarning, stacklevel=3)
         return jnp.asarray(out)
+
+    def absolute_points(self) -> np.ndarray:
+        """The points (P, 3) in the world, float64: with the origin. Not inside `jit`."""
+        return absolute(self.points, self.origin)
+
+    def absolute_values(self) -> np.ndarray:
+        """The values as the field has them, float64: with the offset. Not inside `jit`."""
+        return absolute(self.values, self.offset)
 
     @property
     def dtype(self) -> np.dtype:
@@ -198,7 +280,8 @@ class TetMesh:
         return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(self))
 
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper corner (3,) of the box round the points that cells use."""
+        """Lower and upper corner (3,) of the box round the points that cells use, relative to
+        `origin` as these are."""
         used = self.points[self.cells.reshape(-1)]
         return used.min(axis=0), used.max(axis=0)
 
@@ -213,7 +296,9 @@ class TetMesh:
         # leaves may be tracers or placeholders
         shape = getattr(self.cells, "shape", ("?",))
         points = getattr(self.points, "shape", ("?",))
-        return f"TetMesh({shape[0]} tets, {points[0]} points, {self.location} data)"
+        where = f", relative to {said(self.origin)}" if any(self.origin) else ""
+        less = f" less {said(self.offset)}" if self.offset else ""
+        return f"TetMesh({shape[0]} tets, {points[0]} points{where}, {self.location} data{less})"
 
     def _repr_html_(self) -> str | None:
         from .html import mesh_html
@@ -232,15 +317,19 @@ def _from_cells(
     stacklevel: int,
     flat_before: bool = False,
     strict: bool = False,
+    origin: Origin | None = None,
+    offset: float | None = None,
 ) -> TetMesh:
     """flat_before: flat cells among these have been warned of. strict: the cells come from a file
-    or another program, and repairs of more than a tenth of them are an error."""
-    built = build(points, cells, dtype, field)
+    or another program, and repairs of more than a tenth of them are an error. origin, offset: what
+    points and values are relative to already."""
+    built = build(points, cells, dtype, field, origin)
     if strict:
         require_sound(built)
-    placed, where = place(values, built, location)
+    placed, where, away, lost = place(values, built, location, offset)
     news = dataclasses.replace(built.report, flat=0) if flat_before else built.report
-    for message in (news.warning(), rounded("values", values, placed.dtype)):
+    coarse = news.coarse_warning() if origin is None else None
+    for message in (news.warning(), rounded("values", values, placed.dtype, away), coarse, lost):
         if message:
             warnings.warn(message, UserWarning, stacklevel=stacklevel)
     return trust(
@@ -253,5 +342,7 @@ def _from_cells(
             duplicates=jnp.asarray(built.duplicates),
             location=where,
             report=built.report,
+            origin=built.origin,
+            offset=away,
         )
     )

@@ -273,9 +273,9 @@ def write_mesh(path: Any, mesh: TetMesh) -> None:
     or cannot write this in.
     """
     file = _path(path)
-    points = np.asarray(mesh.points)
+    points = mesh.absolute_points() if any(mesh.origin) else np.asarray(mesh.points)
     cells = np.asarray(mesh.cells)
-    values = np.asarray(mesh.values)
+    values = mesh.absolute_values() if mesh.offset else np.asarray(mesh.values)
     _, sign = signed_volumes(points, cells)
     flip = sign < 0
     order = np.tile(np.arange(4), (len(cells), 1))

@@ -209,6 +209,8 @@ def _round(mesh: TetMesh, share: float, deviation: float) -> TetMesh:
         *(TetMesh, points, blocks, values, mesh.location, mesh.dtype, old.field),
         stacklevel=4,
         flat_before=old.flat > 0,
+        origin=mesh.origin,
+        offset=mesh.offset,
     )
     report = dataclasses.replace(
         made.report,

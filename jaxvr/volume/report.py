@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+# The part of all cells from which on those that float32 distorts are warned of.
+COARSE = 0.1
+
 Counts = tuple[tuple[str, int], ...]
 
 
@@ -19,7 +22,8 @@ class MeshReport:
     the float64 that was given, but not in the float32 of the mesh. folded: tetrahedra that lie the
     wrong way round among their neighbours, whichever way they are written; flat ones do not. seams:
     faces whose two cells use different but coincident points. one_sided: components without a
-    consistent orientation. field: the field's name where it is known.
+    consistent orientation. coarse: tetrahedra of which float32 moves a corner by more than a
+    thousandth of their shortest edge. field: the field's name where it is known.
     """
 
     input_cells: Counts = ()
@@ -35,6 +39,7 @@ class MeshReport:
     seams: int = 0
     duplicate_points: int = 0
     one_sided: int = 0
+    coarse: int = 0
     field: str | None = None
 
     @property
@@ -53,6 +58,18 @@ class MeshReport:
         made = self.tets + self.degenerate + self.crowded
         advice = f" {collapse(self.collapsed)}" if self.collapsed else ""
         return f"{' and '.join(done)}, of {made} in the mesh.{advice}" if done else None
+
+    def coarse_warning(self) -> str | None:
+        """One sentence on cells that float32 distorts, or `None` where those are few."""
+        if self.coarse <= COARSE * self.tets:
+            return None
+        return (
+            f"{self.coarse} of {self.tets} tetrahedra are so small beside the steps of float32 "
+            "where they lie that rounding moves their corners by more than a thousandth of an "
+            "edge. Write points in float64, or relative to a place in their middle; where parts of "
+            "a mesh are far from each other, turn on x64 "
+            '(jax.config.update("jax_enable_x64", True)).'
+        )
 
     def lines(self) -> list[tuple[str, str]]:
         """The report for people: labels and what stands behind them."""
@@ -80,6 +97,8 @@ class MeshReport:
             out.append(("points", closing))
         if self.folded:
             out.append(("folded", f"{self.folded:,} tetrahedra overlap their neighbours"))
+        if self.coarse:
+            out.append(("coarse", f"{self.coarse:,} tetrahedra are small beside float32's steps"))
         if self.one_sided:
             out.append(("one-sided", f"{self.one_sided:,} components"))
         return out
@@ -88,7 +107,7 @@ class MeshReport:
 def collapse(count: int) -> str:
     """Why so many cells lost their volume, and what to do."""
     return (
-        f"{count} of them have a volume in float64: points lose digits in float32. Subtract an "
-        "offset (points - points.mean(0)) or turn on x64 "
+        f"{count} of them have a volume in float64: points lose digits in float32, beside whose "
+        "steps these cells are too small. Turn on x64 "
         '(jax.config.update("jax_enable_x64", True)).'
     )

@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from .mesh import TetMesh
 
 
+def _values(mesh: TetMesh) -> np.ndarray:
+    """As the field has them: float64 where they are held relative to an offset."""
+    return mesh.absolute_values() if mesh.offset else np.asarray(mesh.values)
+
+
 def used_points(mesh: TetMesh) -> np.ndarray:
     """Which points (P,) cells use."""
     used = np.zeros(mesh.n_points, bool)  # a mark for each is quicker than a copy of each corner
@@ -25,8 +30,8 @@ def used_points(mesh: TetMesh) -> np.ndarray:
 
 
 def used_values(mesh: TetMesh) -> np.ndarray:
-    """The values (n,) that cells use, in the order of the mesh's."""
-    values = np.asarray(mesh.values)
+    """The values (n,) that cells use, in the order of the mesh's; as the field has them."""
+    values = _values(mesh)
     return values[used_points(mesh)] if mesh.location == "point" else values.reshape(-1)
 
 
@@ -47,7 +52,7 @@ def weighted_values(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     if not size.sum() > 0:
         size = np.ones(len(size))
     size = size / size.sum()
-    values = np.asarray(mesh.values)
+    values = _values(mesh)
     if mesh.location == "cell":
         return values, size
     quarter = np.repeat(size / 4, 4)

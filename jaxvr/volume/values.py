@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from .._core.checks import is_concrete
-from .build import Built, floats
+from .._core.offsets import bulk, offset_between
+from .build import Built, cast, numbers
+from .digits import lost_values
 
 LOCATIONS = ("point", "cell", "corner")
 
@@ -60,17 +62,50 @@ def choose_location(
     raise ValueError(f"values must have shape {_describe(sizes)}, but has {shape}.")
 
 
-def place(values: Any, built: Built, location: str | None) -> tuple[np.ndarray, str]:
-    """Values given for points or input cells, as those of the built mesh, and their location."""
+def offset_for(given: Any, x: np.ndarray, dtype: np.dtype) -> float:
+    """What to hold numbers (n,), float64, relative to: see `offsets`."""
+    offset = offset_between(*bulk(x), dtype)
+    kinds = {np.asarray(v).dtype.kind for v in given.values()} if isinstance(given, Mapping) else ()
+    whole = kinds or {np.dtype(getattr(given, "dtype", float)).kind}
+    if not offset and dtype == np.float32 and whole <= {"i", "u"}:
+        low, high = float(x.min()), float(x.max())  # whole numbers are to stay what they are
+        if max(-low, high) > 2**24 and high - low < 2**24:
+            offset = float(round((low + high) / 2))
+    return offset
+
+
+def place(
+    values: Any, built: Built, location: str | None, offset: float | None = None
+) -> tuple[np.ndarray, str, float, str | None]:
+    """Values given for points or input cells, as those of the built mesh, their location, what they
+    are relative to, and a warning of digits that are lost.
+
+    offset: what the given ones are relative to; None for values as they are, which may get one.
+    """
+    exact, where = _place(values, built, location)
+    dtype, lost = built.points.dtype, None
+    if offset is None:
+        used = exact.reshape(-1)
+        if where == "point":
+            mark = np.zeros(len(exact), bool)
+            mark[built.cells.reshape(-1)] = True
+            used = exact[mark]
+        offset = offset_for(values, used, dtype)
+        lost = lost_values(values, used, offset, dtype)
+        exact = exact - offset
+    return cast("values", exact, dtype), where, offset, lost
+
+
+def _place(values: Any, built: Built, location: str | None) -> tuple[np.ndarray, str]:
+    """Values of the built mesh in float64, and their location."""
     check_location(location)
-    dtype = built.points.dtype
     if isinstance(values, Mapping):
         if location == "point":
             raise ValueError("values as a dict by cell type cannot have location='point'.")
-        values = _join(values, built, dtype)
+        values = _join(values, built)
         sizes: dict[str, tuple[int, ...]] = {"cell": (built.n_input,)}
     else:
-        values = floats("values", values, dtype)
+        values = numbers("values", values)
         if values.ndim == 2 and values.shape[1] == 1:
             values = values[:, 0]
         sizes = {"point": (len(built.points),), "cell": (built.n_input,)}
@@ -90,10 +125,10 @@ def place(values: Any, built: Built, location: str | None) -> tuple[np.ndarray, 
     return values, where
 
 
-def rounded(name: str, values: Any, dtype: np.dtype) -> str | None:
+def rounded(name: str, values: Any, dtype: np.dtype, offset: float = 0.0) -> str | None:
     """That float32 cannot hold some of these integers (ids, labels, counts), or None."""
     if isinstance(values, Mapping):
-        found = (rounded(f"{name}[{k!r}]", v, dtype) for k, v in values.items())
+        found = (rounded(f"{name}[{k!r}]", v, dtype, offset) for k, v in values.items())
         return next((message for message in found if message), None)
     if dtype != np.float32 or not is_concrete(values):
         return None
@@ -105,19 +140,20 @@ def rounded(name: str, values: Any, dtype: np.dtype) -> str | None:
         return None  # an entry for points, lines or faces, which nobody reads
     if given.dtype.kind not in "iu" or given.size == 0:
         return None
-    wide = given.astype(np.float64)
+    wide = given.astype(np.float64) - offset
     lost = wide != wide.astype(np.float32)
     if not lost.any():
         return None
     first = int(given[lost][0])
     return (
         f"{name} has {int(lost.sum())} integers that float32 cannot hold, the first is {first}, "
-        f"which becomes {int(np.float32(first))}: above 2**24 = {2**24} whole numbers are rounded. "
-        'Subtract an offset, or turn on jax_enable_x64 and pass dtype="float64".'
+        f"which becomes {int(float(np.float32(first - offset)) + offset)}: above 2**24 = {2**24} "
+        "whole numbers are rounded. Subtract an offset, or turn on jax_enable_x64 and pass "
+        'dtype="float64".'
     )
 
 
-def _join(values: Mapping[Any, Any], built: Built, dtype: np.dtype) -> np.ndarray:
+def _join(values: Mapping[Any, Any], built: Built) -> np.ndarray:
     """A dict from cell type to values as one array in the order of the blocks."""
     given = {str(k): v for k, v in values.items()}
     parts = []
@@ -126,7 +162,7 @@ def _join(values: Mapping[Any, Any], built: Built, dtype: np.dtype) -> np.ndarra
             if n == 0:
                 continue
             raise ValueError(f"values has no entry for {name!r}; it has {sorted(given)}.")
-        part = floats(f"values[{name!r}]", given[name], dtype)
+        part = numbers(f"values[{name!r}]", given[name])
         if part.ndim == 2 and part.shape[1] == 1:
             part = part[:, 0]
         if len(part) != n or part.ndim == 0:

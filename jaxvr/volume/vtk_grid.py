@@ -52,6 +52,8 @@ def write_grid(mesh: TetMesh) -> Any:
     except ImportError as e:
         raise ImportError("to_pyvista needs PyVista: pip install pyvista") from e
     points, cells, values = (np.array(x) for x in (mesh.points, mesh.cells, mesh.values))
+    points = mesh.absolute_points() if any(mesh.origin) else points
+    values = mesh.absolute_values() if mesh.offset else values
     _, sign = signed_volumes(points, cells)
     order = np.tile(np.arange(4), (len(cells), 1))
     order[sign < 0] = (0, 1, 3, 2)

@@ -1,0 +1,109 @@
+"""Offsets: what float32 numbers are held relative to where they lie far from 0 and close together.
+
+A float x of p bits is rounded by up to |x| 2^-p, so numbers of a range w round a middle c keep
+|c| / w times less of it than of a range about 0: of 101325 Pa + 0.01 Pa f float32 keeps two values,
+and coordinates of some kilometres from a reference 5,000 km away come in steps of half a metre.
+Where data come in they are float64 still. There an offset in their middle is taken off, in float64,
+and what is left is rounded: the numbers on the device are relative to it. It is a plain float of
+the object that holds them (`TetMesh.origin` and `offset`, `TransferFunction.offset`,
+`Camera.origin`, `Segments.offset`), part of its structure and no leaf. Whoever brings two objects
+together takes the difference of their offsets, in float64 again.
+
+An offset is 0 for most data, and for all in float64. It is a decimal as short as the range allows,
+so that people can read it and two objects made of the same data agree.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Origin = tuple[float, float, float]
+
+NOWHERE: Origin = (0.0, 0.0, 0.0)
+
+# Numbers this many times farther from 0 than their range is wide are held relative to an offset.
+# Below it float32 rounds them by less than 2e-6 of their range, above it pictures lose digits that
+# rendering in float32 else keeps: see "Numbers far from 0" in notebooks/accuracy.md.
+FAR = 32.0
+
+
+def offset_between(low: float, high: float, dtype: Any, width: float | None = None) -> float:
+    """What to take off numbers from `low` to `high`: a decimal in their middle, or 0.0 where
+    `dtype` holds them well. width: the length that their rounding counts against, if not theirs."""
+    width = high - low if width is None else width
+    largest = max(abs(low), abs(high))
+    if np.dtype(dtype) != np.float32 or not 0 < width < math.inf or largest <= FAR * width:
+        return 0.0
+    return float(round(low + (high - low) / 2, -math.floor(math.log10(width))))
+
+
+def bulk(x: np.ndarray) -> tuple[float, float]:
+    """Where most of the numbers (n,) lie: from 1 to 99 % of them, or all where that is one."""
+    few = x if len(x) < 1 << 16 else x[:: len(x) >> 15]
+    low, high = (float(v) for v in np.quantile(few, (0.01, 0.99)))
+    return (low, high) if high > low else (float(x.min()), float(x.max()))
+
+
+def relative(x: Any, offset: Any, dtype: Any) -> Any:
+    """x - offset in `dtype`; NumPy subtracts in float64 and stays NumPy, JAX as wide as x is."""
+    offset = np.asarray(offset, np.float64)
+    if not isinstance(x, jax.Array):
+        return (np.asarray(x, np.float64) - offset).astype(dtype)
+    wide = jnp.promote_types(x.dtype, dtype)
+    return (x.astype(wide) - offset.astype(wide)).astype(dtype)
+
+
+def moved(x: Any, here: Any, there: Any, dtype: Any) -> Any:
+    """What is relative to `here`, relative to `there` and in `dtype`: x itself where they agree."""
+    by = np.asarray(there, np.float64) - np.asarray(here, np.float64)
+    return relative(x, by, dtype) if by.any() else jnp.asarray(x).astype(dtype)
+
+
+def absolute(x: Any, offset: Any) -> np.ndarray:
+    """x + offset in float64."""
+    return np.asarray(x, np.float64) + np.asarray(offset, np.float64)
+
+
+def said(offset: Any) -> str:
+    """An offset or an origin for people, with all of its digits."""
+    if isinstance(offset, tuple):
+        return "(" + ", ".join(said(x) for x in offset) + ")"
+    return f"{offset:.17g}" if abs(offset) >= 1e16 else repr(float(offset)).removesuffix(".0")
+
+
+def origin_of(x: Any) -> Origin:
+    """A place (3,) of known, finite numbers as a tuple, or a ValueError. 0 stands for (0, 0, 0)."""
+    try:
+        place = np.broadcast_to(np.asarray(x, np.float64), (3,))
+    except (TypeError, ValueError):
+        place = np.full(3, np.nan)
+    if not np.isfinite(place).all():
+        raise ValueError(f"origin must be three finite numbers or 0, but is {x!r}.")
+    return (float(place[0]), float(place[1]), float(place[2]))
+
+
+def offset_of(x: Any) -> float:
+    """A known, finite number, or a ValueError."""
+    try:
+        number = float(x)
+    except Exception:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"offset must be a finite number that is known, but is {x!r}.")
+    return number
+
+
+def require_said(name: str, offset_name: str, offset: Any) -> None:
+    """ValueError where new numbers may be relative to an offset, or as they are."""
+    if np.any(offset):
+        raise ValueError(
+            f"{name} are held relative to {offset_name} = {said(offset)}, since float32 keeps too "
+            f"few digits of them otherwise. Say what these are relative to: {offset_name}=0 for "
+            f"numbers as they are, or the {offset_name} of the object for what was made from its "
+            f"own {name}."
+        )

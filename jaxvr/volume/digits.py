@@ -1,0 +1,80 @@
+"""How many digits of what was given are left in a mesh of float32, where an offset cannot help.
+
+Offsets make up for numbers far from 0 (`_core.offsets`), but not for numbers in two places that are
+far from each other, nor for digits that were lost before, in files and arrays of float32.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .._core.offsets import bulk, offset_between
+
+# What float32 may move a point by, as a part of its cell's shortest edge, and a value by, as a part
+# of the range of most of them.
+_COARSE = 1e-3
+# The part of the different values that has to stay different. Of millions, so dense that it does
+# not matter, a tenth falls together.
+_KEPT = 0.75
+# More distinct values than this may fall together and be dense all the same.
+_MANY = 1 << 21
+
+
+def coarse_cells(
+    given: Any, exact: np.ndarray, held: np.ndarray, origin: np.ndarray, cells: np.ndarray
+) -> int:
+    """Cells, of which rounding moves a corner by more than a thousandth of their shortest edge.
+
+    given, exact, held (P, 3): points as they came; in float64, relative to the origin; and in the
+    mesh's dtype. Of points that came in float32 far from 0 the rounding is that which they have.
+    """
+    if origin.any() and _is_single(given):
+        rounding = np.spacing(np.abs(np.asarray(given, np.float32))).max(axis=1) / 2
+    elif held.dtype == np.float64:
+        return 0
+    else:
+        rounding = np.abs(held - exact).max(axis=1)
+    if not rounding.any():
+        return 0
+    corners = exact[cells]
+    shortest = np.full(len(cells), np.inf)
+    for i in range(4):
+        for j in range(i):
+            size = np.abs(corners[:, i] - corners[:, j]).max(axis=1)
+            shortest = np.minimum(shortest, size)
+    return int((rounding[cells].max(axis=1) > _COARSE * shortest).sum())
+
+
+def lost_values(given: Any, numbers: np.ndarray, offset: float, dtype: np.dtype) -> str | None:
+    """What to say of numbers (n,), float64 and as they are, of which too few digits are left."""
+    low, high = bulk(numbers)
+    step = float(np.spacing(np.float32(max(abs(low), abs(high)))))
+    came_single = not isinstance(given, dict) and _is_single(given)
+    if came_single and offset_between(low, high, np.float32) and step > _COARSE * (high - low):
+        return (
+            f"values come in float32, which has steps of {step:.2g} there: most of them lie from "
+            f"{low:.9g} to {high:.9g}, {(high - low) / step:.0f} steps. What was lost is not to be "
+            "had back: write them in float64, or less an offset."
+        )
+    if dtype == np.float64 or came_single or not high - low < np.inf:
+        return None
+    distinct = np.unique(numbers)
+    if len(distinct) > _MANY:
+        return None
+    kept = len(np.unique((distinct - offset).astype(np.float32)))
+    if kept > _KEPT * len(distinct):
+        return None
+    return (
+        f"float32 keeps {kept} of the {len(distinct)} different values: they lie in places far "
+        f"from each other, from {numbers.min():.9g} to {numbers.max():.9g}. Turn on x64 "
+        '(jax.config.update("jax_enable_x64", True)) and pass dtype="float64", or leave out what '
+        "is far."
+    )
+
+
+def _is_single(x: Any) -> bool:
+    """Whether numbers come in less than float64 (whole numbers do not)."""
+    dtype = getattr(x, "dtype", None)
+    return dtype is not None and np.dtype(dtype).kind == "f" and np.dtype(dtype).itemsize < 8
