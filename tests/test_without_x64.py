@@ -21,6 +21,10 @@ double = mesh.replace(values=np.asarray(mesh.values, np.float64) / 2)
 assert jaxvr.render(double, camera, transfer).dtype == np.float32
 rays = jaxvr.render_rays(mesh, np.array([2.0, 1.5, 3.0]), np.array([-2.0, -1.5, -3.0]), transfer)
 assert rays.shape == (4,)
+far = mesh.replace(values=101325 + 0.01 * np.asarray(mesh.values, np.float64))
+ramp = transfer.replace(positions=101325 + 0.01 * np.linspace(0, 1, 4), offset=None)
+assert far.offset and ramp.offset
+assert abs(jaxvr.render(far, camera, ramp) - image).max() < 1e-5
 """
 
 

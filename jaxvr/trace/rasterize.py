@@ -100,7 +100,7 @@ class Fragments:
                 f"The fragments are of an image of {self.height} x {self.width} pixels, but the "
                 f"camera's has {size[0]} x {size[1]}."
             )
-        points, camera = _beside(points, camera, origin)
+        points, camera = beside(points, camera, origin)
         return _locate(self, jnp.asarray(points), jnp.asarray(values), camera)
 
 
@@ -142,7 +142,7 @@ def rasterize(
             "shape of its result. Call it outside, and Fragments.locate inside."
         )
     require_kind("camera", camera, Camera)
-    points, camera = _beside(points, camera, origin)
+    points, camera = beside(points, camera, origin)
     dtype = common_float(None, *(np.asarray(x) for x in (points, values) if x is not None))
     points = as_floats("points", points, ndim=2, dtype=dtype)
     require_shape("points", points, (None, 3))
@@ -268,7 +268,7 @@ def _fill(sort: Sort, source: Triangles, rays: Any, start: Array, room: int) -> 
     return lax.scan(one, nothing, (origins, directions, start))[0]
 
 
-def _beside(points: Any, camera: Camera, origin: Any) -> tuple[Any, Camera]:
+def beside(points: Any, camera: Camera, origin: Any) -> tuple[Any, Camera]:
     """Points and camera relative to one origin."""
     if origin is not None:
         return points, camera.relative_to(origin)
