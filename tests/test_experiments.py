@@ -33,6 +33,7 @@ from experiments import (
     limits,
     log_table,
     mesh_faults,
+    offsets,
     preintegration_build,
     quantised_table,
     speed,
@@ -78,6 +79,12 @@ def log_table_gain(folder: Path) -> float:
     assert (folder / "log_table_shells.png").stat().st_size > 0
     rms = {row["table"]: row["rms"] for row in report["transfer"]["shells"]}
     return rms["linear"] / rms["log"]
+
+
+def offsets_error(folder: Path) -> float:
+    found = offsets.run(8)
+    assert len(found) > 20 and None not in found.values()
+    return max(found.values())
 
 
 def units_range(folder: Path) -> float:
@@ -262,6 +269,7 @@ EXPERIMENTS = [
     (layouts_chord, 1e-9, 1e-6),
     (limits_cells, 5, 20),
     (units_range, 98, 100),
+    (offsets_error, 1e-8, 1e-5),
     (library_faults_good, 0.999, 1.001),
     (mesh_faults_wrong, -1, 1),
     (file_faults_wrong, -1, 1),
