@@ -20,6 +20,7 @@ from jaxvr import Camera, TetMesh, TransferFunction, datasets
 from jaxvr.interact.orbit import Orbit
 from jaxvr.interact.viewer import Viewer
 from jaxvr.order import exact_order
+from jaxvr.testing import assert_render_close
 from jaxvr.trace import KBuffer
 from jaxvr.trace.rasterize import beside
 
@@ -99,6 +100,11 @@ def test_pictures(scene, near):
         for s in (scene, near)
     ]
     assert np.abs(orbit[0] - np.asarray(orbit[1])).max() < 1e-5
+
+
+def test_against_brute_force(both):
+    """In float64, in the world, whose code takes no offset off."""
+    assert_render_close(both.mesh, both.camera, both.transfer, atol=1e-5)
 
 
 def test_sorted_faces(both, near):
@@ -215,6 +221,10 @@ def test_a_transfer_function_and_its_offset(both, tmp_path):
         assert np.abs(a - np.asarray(b)).max() < 1e-5 * np.abs(b).max()
     for a, b in zip(tf.with_points(9)(fine), near.with_points(9)((fine - 101325) / 0.01)):
         assert np.abs(a - np.asarray(b)).max() < 1e-5 * np.abs(b).max()
+    whole = jnp.asarray([101325.0, 101326.0], jnp.float32)  # 101325.01 itself is none of float32
+    same = TransferFunction(whole, COLORS[:2], [1, 2], dtype="float32")
+    assert same.offset == 0  # JAX's arrays are taken as they are
+    assert np.abs(same.relative_to(101325.01).positions - np.array([-0.01, 0.99])).max() < 1e-7
     shifted = tf.relative_to(101320)
     assert np.abs(shifted.absolute_positions() - x).max() < 1e-6
     double = tf.astype("float64").relative_to(0)

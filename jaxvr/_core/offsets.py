@@ -55,7 +55,8 @@ def relative(x: Any, offset: Any, dtype: Any) -> Any:
     if not isinstance(x, jax.Array):
         return (np.asarray(x, np.float64) - offset).astype(dtype)
     wide = jnp.promote_types(x.dtype, dtype)
-    return (x.astype(wide) - offset.astype(wide)).astype(dtype)
+    first = offset.astype(wide)  # of float32 not all of it: the rest goes after
+    return ((x.astype(wide) - first) - (offset - first).astype(wide)).astype(dtype)
 
 
 def moved(x: Any, here: Any, there: Any, dtype: Any) -> Any:

@@ -60,10 +60,11 @@ class BruteForce:
     def __init__(self, mesh: Any, exact: Any = Exact):
         self.exact = exact
         self.shift = 1024 * float(np.finfo(exact).eps)
-        points = np.asarray(mesh.points, np.float64)
+        # In the world, as rays and transfer functions are.
+        points = np.asarray(mesh.points, np.float64) + getattr(mesh, "origin", 0.0)
         self.cells = np.asarray(mesh.cells)
         self.corners = points[self.cells]
-        values = np.asarray(mesh.values, np.float64)
+        values = np.asarray(mesh.values, np.float64) + getattr(mesh, "offset", 0.0)
         self.values = {
             "point": lambda: values[self.cells],
             "cell": lambda: np.repeat(values[:, None], 4, 1),
@@ -202,6 +203,7 @@ class BruteForce:
             np.asarray(getattr(transfer, k), np.float64)
             for k in ("positions", "extinctions", "colors")
         )
+        table = (table[0] + getattr(transfer, "offset", 0.0), *table[1:])
         origins, directions = np.asarray(origins), np.asarray(directions)
         rgba, length = np.zeros((len(origins), 4)), np.zeros(len(origins))
         for i in range(0, len(origins), chunk):

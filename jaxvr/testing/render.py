@@ -26,7 +26,7 @@ def camera_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     ((2j + 1)/width - 1) * half * width/height and y = (1 - (2i + 1)/height) * half, where half is
     tan(fov/2) of a pinhole's full vertical angle, or half of the extent of an orthographic camera.
     """
-    eye, target, up = (np.asarray(getattr(camera, k), np.float64) for k in ("eye", "target", "up"))
+    (eye, target), up = camera.absolute(), np.asarray(camera.up, np.float64)
     width, height = camera.width, camera.height
 
     def unit(v):
