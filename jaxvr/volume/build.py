@@ -349,6 +349,7 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
         seams=int(((neighbors >= 0) & ((neighbors >> 3) & 1 == 1)).sum()) // 2,
         duplicate_points=len(duplicates),
         one_sided=one_sided,
+        components=conn.components(len(rows), pairs)[0],
         field=field,
     )
     return Built(

@@ -111,10 +111,9 @@ def hold(mesh: Any, bits: Array) -> Array:
     """Status bits of any shape, with BROKEN where integers are traced and not those of a mesh, or
     where traced points turn the mesh inside out, and LOST where points are not finite.
 
-    Of what `require_mesh` finds, this leaves out single components that are inside out in a mesh
-    that as a whole is not. It costs as much as some tens of thousands of rays where integers are
-    traced, a pass over the boundary where points are, and nothing where both are known: close over
-    the mesh, and pass `mesh.replace(...)` what is traced.
+    It costs as much as some tens of thousands of rays where integers are traced, a pass over the
+    boundary where points are (and some over the cells, in several components), and nothing where
+    both are known: close over the mesh, and pass `mesh.replace(...)` what is traced.
     """
     if not _is_traced(mesh):
         return bits
@@ -142,11 +141,48 @@ def _is_traced(mesh: Any) -> bool:
 
 
 def _is_right_way_round(mesh: Any) -> Array:
-    """Whether () the boundary encloses a volume that is not below 0, but for rounding."""
+    """Whether () the boundary of each component encloses a volume that is not below 0, but for
+    rounding. Where some components are one-sided, and enclose nothing, they are taken together."""
     if not mesh.boundary.shape[0]:
         return jnp.asarray(True)
-    volume, error = enclosed(lax.stop_gradient(mesh.points), mesh.cells, mesh.boundary, jnp)
-    return ~(volume.sum() < -error.sum())
+    known = lax.stop_gradient(mesh.points), mesh.cells, mesh.boundary, jnp
+    if mesh.report.components == 1 or mesh.report.one_sided:
+        volume, error = enclosed(*known)
+        return ~(volume.sum() < -error.sum())
+    label = components_of(mesh.neighbors)
+    label = label[jnp.clip(packing.cell_of(mesh.boundary), 0, len(label) - 1)]
+    sums = (jnp.zeros(len(mesh.cells), x.dtype).at[label].add(x) for x in enclosed(*known, label))
+    volume, error = sums
+    return ~jnp.any(volume < -error)
+
+
+def components_of(neighbors: Array) -> Array:
+    """The lowest cell (T,) of each cell's component, from the words (T, 4) of a mesh.
+
+    Labels of neighbours are taken on, by the cells that are labels too, and labels of labels, so
+    that the number of passes grows with the logarithm of the distance across a component.
+    """
+    if is_concrete(neighbors):
+        with jax.ensure_compile_time_eval():
+            return _components_of(jnp.asarray(neighbors))
+    return _components_of(neighbors)
+
+
+@jax.jit
+def _components_of(neighbors: Array) -> Array:
+    count = neighbors.shape[0]
+    own = jnp.arange(count, dtype=jnp.int32)
+    other = jnp.clip(packing.cell_of(neighbors), 0, count - 1)
+    other = jnp.where(neighbors >= 0, other, own[:, None])
+
+    def spread(loop: tuple[Array, Array]) -> tuple[Array, Array]:
+        label, _ = loop
+        lowest = jnp.minimum(label, label[other].min(1))
+        new = jnp.minimum(label.at[label].min(lowest), lowest)
+        new = new[new]
+        return new, jnp.any(new != label)
+
+    return lax.while_loop(lambda loop: loop[1], spread, (own, jnp.asarray(True)))[0]
 
 
 def _is_closed(mesh: Any) -> Array:
