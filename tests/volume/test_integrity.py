@@ -84,6 +84,53 @@ def test_traced_points_that_are_not_finite_are_told_to_all_rays():
     assert not fits(MESH).any()
 
 
+@pytest.mark.parametrize("name", [*INTEGERS, "duplicates"])
+@pytest.mark.parametrize("kind", ["int16", "int64"])
+def test_integers_of_another_width_are_an_error(name, kind):
+    """Compiled loops would read them as what they are not."""
+    wide = changed(**{name: np.asarray(getattr(MESH, name)).astype(kind)})
+    for draw in (jaxvr.render, jax.jit(lambda *x: jaxvr.render(*x, status=True))):
+        if draw is not jaxvr.render and kind == "int64" and not jax.config.jax_enable_x64:
+            continue  # a jit without 64 bits makes 32 of them
+        with pytest.raises(ValueError, match=rf"mesh\.{name} must hold integers \(int32\).*{kind}"):
+            draw(wide, CAMERA, TRANSFER)
+
+
+def test_points_and_values_of_two_dtypes_are_an_error():
+    for name in ("points", "values"):
+        for kind in ("float16", "int32"):
+            mixed = changed(**{name: getattr(MESH, name).astype(kind)})
+            with pytest.raises(ValueError, match=r"mesh\.\w+ has dtype"):
+                jaxvr.render(mixed, CAMERA, TRANSFER)
+
+
+SEGMENTS = {
+    "halved": lambda s: {"start": s.start / 2},
+    "scaled": lambda s: {"start": s.start * 1000},
+    "reversed": lambda s: {"start": s.start[::-1]},
+    "wide": lambda s: {"start": np.asarray(s.start).astype("int64")},
+    "places": lambda s: {"order": s.order * 3},
+    "cut": lambda s: {"order": s.order[:-1]},
+    "mixed": lambda s: {"length": s.length.astype("float16")},
+    "shifted": lambda s: {"start": s.start + 1},
+    "no number": lambda s: {"scalar": s.scalar * jnp.nan},
+}
+
+
+@pytest.mark.parametrize("name", SEGMENTS)
+def test_segments_that_were_computed_with_are_told(name):
+    """In an error, or under jit, where integers of the right kind are traced, a picture of NaN."""
+    segments = jaxvr.trace(MESH, CAMERA)
+    change = SEGMENTS[name](segments)
+    broken = dataclasses.replace(segments, **change)
+    with pytest.raises(ValueError, match=rf"segments\.{next(iter(change))}"):
+        jaxvr.shade(broken, TRANSFER)
+    if name in ("scaled", "places"):
+        shade = jax.jit(lambda s: jaxvr.shade(s, TRANSFER, adjoint=ENGINES["jax"]))
+        assert np.isnan(shade(broken)).all()
+        assert np.isfinite(shade(segments)).all()
+
+
 def test_integers_of_another_mesh():
     other = jaxvr.datasets.box((2, 1, 1), field=lambda p: p[:, 0], dtype="float32")
     with pytest.raises(ValueError, match="must have shape"):
