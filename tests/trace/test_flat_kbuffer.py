@@ -197,8 +197,10 @@ def test_gradients_across_flat_and_overturned_cells(direction, quick_jit):
     p, q, r = shape.points[rng.choice(cells, len(origins))[:, :3]].swapaxes(0, 1)
     sizes = np.sort(np.abs(directions), axis=1)
     free = (np.diff(sizes, axis=1, prepend=0) > 0.01).all(1)
-    assert free.sum() > 20
-    eyes = jnp.where(free[:, None], p / 2 + (q + r) / 4, origins)
+    eyes = p / 2 + (q + r) / 4
+    free &= ((eyes > 0) & (eyes < 1)).all(1)  # not on the hull, where the light begins
+    assert free.sum() > 10
+    eyes = jnp.where(free[:, None], eyes, origins)
     ours, theirs = (g(mesh.points, mesh.values, eyes) for g in (found, wanted))
     for i, (a, b) in enumerate(zip(ours, theirs, strict=True)):
         a, b = (x[shape.inner] if i == 0 else x for x in (a, b))
