@@ -25,6 +25,7 @@ from jaxvr.adjoint import AbstractAdjoint, Replay
 from jaxvr.composite import Over
 from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
 from jaxvr.trace import AbstractTracer, RayCast, Segments
+from jaxvr.trace.integrity import require_segments
 from jaxvr.view.camera import Camera
 from jaxvr.volume.integrity import require_mesh
 from jaxvr.volume.mesh import TetMesh
@@ -115,6 +116,7 @@ def transfer_of(transfer: Any, volume: Any) -> TransferFunction:
 def segments_of(segments: Any) -> Segments:
     hint = "Make them with jaxvr.trace(volume, camera), or pass the volume to jaxvr.render."
     require_kind("segments", segments, Segments, hint)
+    require_segments(segments)
     return segments
 
 

@@ -46,6 +46,7 @@ from jaxvr.composite import Over
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.trace import AbstractTracer, Recorded, Segments
 from jaxvr.trace.beam import are_rays
+from jaxvr.trace.integrity import unfit
 from jaxvr.trace.recorded import Nodes, fill, record
 from jaxvr.units import mesh_in, transfer_in, units_of
 from jaxvr.view.camera import Camera
@@ -343,7 +344,8 @@ def shade(
     """The image of traced segments: what `render` gives, without the walk.
 
     Args:
-      segments: from `trace`. The rest as for `render`.
+      segments: from `trace`, whose integers are not to be computed with: a ValueError, or under
+        your own `jit` a picture of NaN. The rest as for `render`.
 
     Returns:
       image (height, width, 4), or (..., 4) for segments of rays. Differentiable in `transfer`,
@@ -357,7 +359,7 @@ def shade(
         image, bits = _shade(*how, bare(segments), bare(transfer), background_of(background))
     if is_concrete(bits):
         check(bits)
-    return image
+    return unfit(segments, image)
 
 
 def _how(pipeline: Pipeline, adjoint: Any, budget: Any, volume: Any) -> tuple[Any, Any, int]:

@@ -494,8 +494,9 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
         inside = found & ~outside
         outside = jnp.where(found, inside & (second.words[1] < 0), outside)
     begin, end = (lax.stop_gradient(z) for z in (jnp.where(start.cut, start.at.z, one.z), two.z))
-    # A segment of no length has a derivative, where that is not a matter of more than rounding.
-    flat = (segment.length == 0) & (after.lead == 0) & (begin >= 0) & (end >= 0)
+    # A segment of no length has a derivative, where that is not a matter of more than rounding: so
+    # has one that ends at the eye, which the next makes up for.
+    flat = (segment.length == 0) & (after.lead == 0) & (jnp.maximum(begin, end) >= 0)
     given = inside & ((segment.length > 0) | flat)
 
     buffer, left, drop = forget(buffer, first.words, pair, give, found, by_cells)

@@ -377,6 +377,7 @@ def build(
         seams=int(((neighbors >= 0) & ((neighbors >> 3) & 1 == 1)).sum()) // 2,
         duplicate_points=len(duplicates),
         one_sided=one_sided,
+        components=conn.components(len(rows), pairs)[0],
         field=field,
         coarse=coarse_cells(points, exact, pts, np.asarray(origin), rows),
     )

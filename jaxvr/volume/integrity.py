@@ -41,14 +41,14 @@ _ADVICE = (
 _known: dict[tuple[int, ...], tuple[weakref.ref, ...]] = {}
 
 
-def _is_known(arrays: tuple[Any, ...], n_points: int = 0) -> bool:
+def found_right(arrays: tuple[Any, ...], n_points: int = 0) -> bool:
     found = _known.get((n_points, *map(id, arrays)))
     return found is not None and all(
         ref() is array for ref, array in zip(found, arrays, strict=True)
     )
 
 
-def _remember(arrays: tuple[Any, ...], n_points: int = 0) -> None:
+def remember(arrays: tuple[Any, ...], n_points: int = 0) -> None:
     key = (n_points, *map(id, arrays))
 
     def forget(_: Any) -> None:
@@ -65,15 +65,15 @@ def _connectivity(mesh: Any) -> tuple[Any, ...]:
 
 def trust(mesh: Any) -> Any:
     """The mesh, whose arrays were just made by `build`."""
-    _remember(_connectivity(mesh), mesh.points.shape[0])
-    _remember((mesh.points,))
-    _remember((mesh.values,))
+    remember(_connectivity(mesh), mesh.points.shape[0])
+    remember((mesh.points,))
+    remember((mesh.values,))
     return trust_entries(mesh)
 
 
 def trust_entries(mesh: Any) -> Any:
     """The mesh, whose `entry` bits are known to fit its points."""
-    _remember((mesh.points, *_connectivity(mesh)))
+    remember((mesh.points, *_connectivity(mesh)))
     return mesh
 
 
@@ -82,11 +82,11 @@ def require_mesh(mesh: Any) -> None:
     only kinds and shapes are looked at."""
     require_connectivity(mesh)
     for name, x in (("points", mesh.points), ("values", mesh.values)):
-        if is_concrete(x) and not _is_known((x,)):
+        if is_concrete(x) and not found_right((x,)):
             require_finite(f"mesh.{name}", x)
-            _remember((x,))
+            remember((x,))
     connectivity = _connectivity(mesh)
-    if is_concrete(mesh.points, *connectivity) and not _is_known((mesh.points, *connectivity)):
+    if is_concrete(mesh.points, *connectivity) and not found_right((mesh.points, *connectivity)):
         if mirrored(mesh.points, mesh.cells, mesh.neighbors, mesh.boundary)[0] is not None:
             raise ValueError(
                 "mesh.points turn the mesh, or a component of it, inside out, and mesh.boundary "
@@ -101,20 +101,19 @@ def require_connectivity(mesh: Any) -> None:
     _require_kinds(mesh)
     connectivity = _connectivity(mesh)
     n_points = mesh.points.shape[0]
-    if is_concrete(*connectivity) and not _is_known(connectivity, n_points):
+    if is_concrete(*connectivity) and not found_right(connectivity, n_points):
         cells, neighbors, boundary, duplicates = map(np.asarray, connectivity)
         _require_connectivity(cells, neighbors, boundary, duplicates, n_points)
-        _remember(connectivity, n_points)
+        remember(connectivity, n_points)
 
 
 def hold(mesh: Any, bits: Array) -> Array:
     """Status bits of any shape, with BROKEN where integers are traced and not those of a mesh, or
     where traced points turn the mesh inside out, and LOST where points are not finite.
 
-    Of what `require_mesh` finds, this leaves out single components that are inside out in a mesh
-    that as a whole is not. It costs as much as some tens of thousands of rays where integers are
-    traced, a pass over the boundary where points are, and nothing where both are known: close over
-    the mesh, and pass `mesh.replace(...)` what is traced.
+    It costs as much as some tens of thousands of rays where integers are traced, a pass over the
+    boundary where points are (and some over the cells, in several components), and nothing where
+    both are known: close over the mesh, and pass `mesh.replace(...)` what is traced.
     """
     if not _is_traced(mesh):
         return bits
@@ -142,11 +141,48 @@ def _is_traced(mesh: Any) -> bool:
 
 
 def _is_right_way_round(mesh: Any) -> Array:
-    """Whether () the boundary encloses a volume that is not below 0, but for rounding."""
+    """Whether () the boundary of each component encloses a volume that is not below 0, but for
+    rounding. Where some components are one-sided, and enclose nothing, they are taken together."""
     if not mesh.boundary.shape[0]:
         return jnp.asarray(True)
-    volume, error = enclosed(lax.stop_gradient(mesh.points), mesh.cells, mesh.boundary, jnp)
-    return ~(volume.sum() < -error.sum())
+    known = lax.stop_gradient(mesh.points), mesh.cells, mesh.boundary, jnp
+    if mesh.report.components == 1 or mesh.report.one_sided:
+        volume, error = enclosed(*known)
+        return ~(volume.sum() < -error.sum())
+    label = components_of(mesh.neighbors)
+    label = label[jnp.clip(packing.cell_of(mesh.boundary), 0, len(label) - 1)]
+    sums = (jnp.zeros(len(mesh.cells), x.dtype).at[label].add(x) for x in enclosed(*known, label))
+    volume, error = sums
+    return ~jnp.any(volume < -error)
+
+
+def components_of(neighbors: Array) -> Array:
+    """The lowest cell (T,) of each cell's component, from the words (T, 4) of a mesh.
+
+    Labels of neighbours are taken on, by the cells that are labels too, and labels of labels, so
+    that the number of passes grows with the logarithm of the distance across a component.
+    """
+    if is_concrete(neighbors):
+        with jax.ensure_compile_time_eval():
+            return _components_of(jnp.asarray(neighbors))
+    return _components_of(neighbors)
+
+
+@jax.jit
+def _components_of(neighbors: Array) -> Array:
+    count = neighbors.shape[0]
+    own = jnp.arange(count, dtype=jnp.int32)
+    other = jnp.clip(packing.cell_of(neighbors), 0, count - 1)
+    other = jnp.where(neighbors >= 0, other, own[:, None])
+
+    def spread(loop: tuple[Array, Array]) -> tuple[Array, Array]:
+        label, _ = loop
+        lowest = jnp.minimum(label, label[other].min(1))
+        new = jnp.minimum(label.at[label].min(lowest), lowest)
+        new = new[new]
+        return new, jnp.any(new != label)
+
+    return lax.while_loop(lambda loop: loop[1], spread, (own, jnp.asarray(True)))[0]
 
 
 def _is_closed(mesh: Any) -> Array:
@@ -216,8 +252,18 @@ def _fits(
 def _require_kinds(mesh: Any) -> None:
     for name in ("cells", "neighbors", "boundary", "duplicates"):
         x = getattr(mesh, name)
-        if np.dtype(x.dtype).kind != "i":
-            raise ValueError(f"mesh.{name} must hold integers, but has dtype {x.dtype}. {_ADVICE}")
+        # Compiled loops read 32 bits, whatever the array holds.
+        if x.dtype != np.int32:
+            raise ValueError(
+                f"mesh.{name} must hold integers (int32), but has dtype {x.dtype}. {_ADVICE}"
+            )
+    for name in ("points", "values"):
+        dtype = np.dtype(getattr(mesh, name).dtype)
+        if dtype not in (np.float32, np.float64) or dtype != mesh.points.dtype:
+            raise ValueError(
+                f"mesh.{name} has dtype {dtype}; points and values must have the same, float32 or "
+                "float64. mesh.replace(...) casts to that of the points."
+            )
     count, points = mesh.cells.shape[0], mesh.points.shape[0]
     values = {"point": (points,), "cell": (count,), "corner": (count, 4)}[mesh.location]
     wanted = {

@@ -167,8 +167,8 @@ class TetMesh:
         Points that mirror the mesh (an axis with another sign, two axes swapped), or a part of it
         that hangs together, turn all cells over: outside tracing its `entry` bits go with it. Where
         more than a quarter of the volume at the boundary is turned over without that, a warning
-        says how many cells are. Inside tracing the bits stay: there a mesh that is mirrored as a
-        whole ends in a status, or in a picture of NaN.
+        says how many cells are. Inside tracing the bits stay: there a mesh of which a component is
+        mirrored ends in a status, or in a picture of NaN.
         """
         new: dict[str, Any] = {}
         looked = False

@@ -25,17 +25,22 @@ def outer_faces(cells: Any, boundary: Any, xp: Any = np) -> Any:
     return xp.take_along_axis(cells[cell], face, axis=1)
 
 
-def enclosed(points: Any, cells: Any, boundary: Any, xp: Any = np) -> tuple[Any, Any]:
+def enclosed(
+    points: Any, cells: Any, boundary: Any, xp: Any = np, label: Any = None
+) -> tuple[Any, Any]:
     """What each face of the boundary adds to six times the volume that it encloses, as its `entry`
     bit orients it (F,), in units of the mesh's own, and how much rounding may add to that (F,).
 
     By Gauss's theorem the volume is the sum of det(a - o, b - o, c - o) over the faces a, b, c seen
     from outside, wherever o is: that of a mirrored mesh is below 0, whatever its cells are. A
     determinant errs by no more than some ulps of |a - o| |b - o| |c - o|. xp: NumPy, or jax.numpy.
+    label (F,): a cell of each face's component, for sums by components: o is a point of it then,
+    since small ones far from the middle of all would be below the rounding.
     """
     corners = points[outer_faces(cells, boundary, xp)]
     low, high = (f(corners, (0, 1), keepdims=True) for f in (xp.min, xp.max))
-    corners = corners - 0.5 * (low + high)
+    middle = 0.5 * (low + high) if label is None else points[cells[label, 0]][:, None]
+    corners = corners - middle
     limits = xp.finfo(points.dtype)
     corners = corners / xp.maximum(xp.abs(corners).max(), limits.tiny)
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]

@@ -22,8 +22,9 @@ class MeshReport:
     the float64 that was given, but not in the float32 of the mesh. folded: tetrahedra that lie the
     wrong way round among their neighbours, whichever way they are written; flat ones do not. seams:
     faces whose two cells use different but coincident points. one_sided: components without a
-    consistent orientation. coarse: tetrahedra of which float32 moves a corner by more than a
-    thousandth of their shortest edge. field: the field's name where it is known.
+    consistent orientation. components: sets of cells that hang together by faces, 0 if that was not
+    counted. coarse: tetrahedra of which float32 moves a corner by more than a thousandth of their
+    shortest edge. field: the field's name where it is known.
     """
 
     input_cells: Counts = ()
@@ -40,6 +41,7 @@ class MeshReport:
     duplicate_points: int = 0
     one_sided: int = 0
     coarse: int = 0
+    components: int = 0
     field: str | None = None
 
     @property

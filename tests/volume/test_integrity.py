@@ -14,7 +14,8 @@ import pytest
 
 import jaxvr
 from jaxvr._core.status import BROKEN, LOST, UNSORTED
-from jaxvr.volume.integrity import hold, require_mesh
+from jaxvr.volume import packing
+from jaxvr.volume.integrity import components_of, hold, require_mesh
 
 MESH = jaxvr.datasets.box((2, 2, 1), field=lambda p: p[:, 0] + 0.2 * p[:, 1], dtype="float32")
 CAMERA = jaxvr.Camera.orbit(MESH, azimuth=31, elevation=17, width=4, height=3)
@@ -81,6 +82,53 @@ def test_traced_points_that_are_not_finite_are_told_to_all_rays():
     for number in (jnp.nan, jnp.inf):
         assert (fits(changed(points=MESH.points.at[3, 1].set(number))) == LOST).all()
     assert not fits(MESH).any()
+
+
+@pytest.mark.parametrize("name", [*INTEGERS, "duplicates"])
+@pytest.mark.parametrize("kind", ["int16", "int64"])
+def test_integers_of_another_width_are_an_error(name, kind):
+    """Compiled loops would read them as what they are not."""
+    wide = changed(**{name: np.asarray(getattr(MESH, name)).astype(kind)})
+    for draw in (jaxvr.render, jax.jit(lambda *x: jaxvr.render(*x, status=True))):
+        if draw is not jaxvr.render and kind == "int64" and not jax.config.jax_enable_x64:
+            continue  # a jit without 64 bits makes 32 of them
+        with pytest.raises(ValueError, match=rf"mesh\.{name} must hold integers \(int32\).*{kind}"):
+            draw(wide, CAMERA, TRANSFER)
+
+
+def test_points_and_values_of_two_dtypes_are_an_error():
+    for name in ("points", "values"):
+        for kind in ("float16", "int32"):
+            mixed = changed(**{name: getattr(MESH, name).astype(kind)})
+            with pytest.raises(ValueError, match=r"mesh\.\w+ has dtype"):
+                jaxvr.render(mixed, CAMERA, TRANSFER)
+
+
+SEGMENTS = {
+    "halved": lambda s: {"start": s.start / 2},
+    "scaled": lambda s: {"start": s.start * 1000},
+    "reversed": lambda s: {"start": s.start[::-1]},
+    "wide": lambda s: {"start": np.asarray(s.start).astype("int64")},
+    "places": lambda s: {"order": s.order * 3},
+    "cut": lambda s: {"order": s.order[:-1]},
+    "mixed": lambda s: {"length": s.length.astype("float16")},
+    "shifted": lambda s: {"start": s.start + 1},
+    "no number": lambda s: {"scalar": s.scalar * jnp.nan},
+}
+
+
+@pytest.mark.parametrize("name", SEGMENTS)
+def test_segments_that_were_computed_with_are_told(name):
+    """In an error, or under jit, where integers of the right kind are traced, a picture of NaN."""
+    segments = jaxvr.trace(MESH, CAMERA)
+    change = SEGMENTS[name](segments)
+    broken = dataclasses.replace(segments, **change)
+    with pytest.raises(ValueError, match=rf"segments\.{next(iter(change))}"):
+        jaxvr.shade(broken, TRANSFER)
+    if name in ("scaled", "places"):
+        shade = jax.jit(lambda s: jaxvr.shade(s, TRANSFER, adjoint=ENGINES["jax"]))
+        assert np.isnan(shade(broken)).all()
+        assert np.isfinite(shade(segments)).all()
 
 
 def test_integers_of_another_mesh():
@@ -185,6 +233,57 @@ def test_points_that_mirror_while_traced_are_told(unit):
         assert (np.asarray(bits) & BROKEN).all()
         assert np.isnan(jax.jit(draw, static_argnums=1)(-MESH.points, False)).all()
         assert np.isfinite(jax.jit(draw, static_argnums=1)(MESH.points, False)).all()
+
+
+def apart(sizes, places):
+    """Boxes of these sizes about these places, (N,) and (N, 3), and the box (P,) of each point."""
+    points, cells = np.asarray(MESH.points, np.float64), np.asarray(MESH.cells)
+    middle, count = points.mean(0), len(points)
+    both = np.concatenate([(points - middle) * s + p for s, p in zip(sizes, places, strict=True)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # rows of a mesh are sorted, not oriented
+        mesh = jaxvr.TetMesh.from_cells(
+            both.astype(np.float32),
+            {"tetra": np.concatenate([cells + k * count for k in range(len(sizes))])},
+            both[:, 0],
+        )
+    return mesh, np.repeat(np.arange(len(sizes)), count)
+
+
+@pytest.mark.parametrize("traced", ["all leaves", "points"])
+def test_a_component_that_is_mirrored_while_traced_is_told(traced):
+    """Whichever of several it is, and however small it is beside the others."""
+    places = np.array([[0, 0, 0], [3, 0, 0], [0, 5, 0], [7, 7, 7.0]])
+    mesh, of = apart([1, 1, 2, 1e-3], places)
+    assert mesh.report.components == 4
+    for mesh in (mesh, dataclasses.replace(mesh, report=jaxvr.volume.MeshReport())):  # not counted
+        if traced == "points":
+            fits = jax.jit(lambda p, m=mesh: hold(m.replace(points=p), jnp.zeros((), jnp.int32)))
+        else:
+            held = jax.jit(lambda m: hold(m, jnp.zeros((), jnp.int32)))
+            fits = lambda p, m=mesh: held(dataclasses.replace(m, points=p))  # noqa: E731
+        assert int(fits(mesh.points)) == 0
+        for chosen in ([0], [1], [3], [0, 3], [0, 1, 2, 3]):
+            mirrored = np.array(mesh.points)
+            for k in chosen:
+                mirrored[of == k, 2] = 2 * np.float32(places[k, 2]) - mirrored[of == k, 2]
+            assert int(fits(jnp.asarray(mirrored))) == BROKEN, chosen
+        flat = mesh.points.at[:, 2].set(jnp.where(of == 1, 0.0, mesh.points[:, 2]))
+        assert int(fits(flat)) == 0
+
+
+def test_components_are_those_of_a_search():
+    rng = np.random.default_rng(3)
+    for count, links in ((1, 0), (40, 12), (300, 220), (300, 290)):
+        words = np.full((count, 4), -1, np.int32)
+        order = rng.permutation(count)  # a long path in no order, cut in places
+        for a, b in zip(order[:links], order[1:], strict=False):
+            words[a, 1], words[b, 2] = packing.pack(b, 2, 0), packing.pack(a, 1, 0)
+        want, pairs = np.arange(count), np.argwhere(words >= 0)
+        for _ in range(count):
+            for a, k in pairs:
+                want[a] = min(want[a], want[packing.cell_of(words[a, k])])
+        assert np.array_equal(components_of(jnp.asarray(words)), want)
 
 
 def test_one_sided_meshes_have_no_rule_for_entries():
