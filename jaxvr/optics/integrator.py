@@ -150,7 +150,9 @@ class AbstractSlabIntegrator(AbstractIntegrator):
         return Cursor(scalar, locate(table.position, scalar))
 
     def step(self, table, segment, cursor):
-        wanted = jnp.any(segment.length > 0)
+        # Segments of no length are not seen, but they have derivatives, whatever the other rays of
+        # the batch are in.
+        wanted = jnp.any(segment.length > 0 if table.image_only else segment.length >= 0)
         if table.texture is not None:
             cursor = stage(wanted, look_up, table, segment, cursor)
         piece, cursor, finished = stage(jnp.any(segment.length >= 0), cut, table, segment, cursor)
@@ -176,7 +178,7 @@ class AbstractSlabIntegrator(AbstractIntegrator):
 
         piece, slabs = piece
         segment_bar, slabs_bar = stage(
-            jnp.any(segment.length > 0), pull, segment, piece, slabs, cotangent
+            jnp.any(segment.length >= 0), pull, segment, piece, slabs, cotangent
         )
         if gradient is not None:
             rows = jnp.concatenate([slabs_bar.position[:, None], slabs_bar.optical], 1)

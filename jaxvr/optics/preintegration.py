@@ -183,7 +183,7 @@ class PreIntegration(AbstractWholeIntegrator):
 
     def blend(self, frame, rows, segment):
         # Stages, or everything up to here is computed again for each of the four channels.
-        wanted = jnp.any(segment.length > 0)
+        wanted = jnp.any(segment.length >= 0)
         way, before, after = stage(wanted, self._ways, frame, segment)
         inside = stage(wanted, _trilinear, rows, way)
         most = 1 - jnp.finfo(inside.dtype).epsneg

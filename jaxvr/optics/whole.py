@@ -51,7 +51,7 @@ class AbstractWholeIntegrator(AbstractIntegrator):
         return Cursor(jax.lax.stop_gradient(scalar), jnp.zeros(scalar.shape, jnp.int32))
 
     def step(self, table, segment, cursor):
-        wanted = jnp.any(segment.length > 0)
+        wanted = jnp.any(segment.length >= 0)  # those of no length have derivatives
         ids = stage(wanted, self.address, table, segment)
         rows = stage(wanted, _gather, table.rows, ids)
         rgb, depth = stage(wanted, self.blend, table.frame, rows, segment)
@@ -65,7 +65,7 @@ class AbstractWholeIntegrator(AbstractIntegrator):
             return jax.vjp(self.blend, frame, rows, segment)[1](cotangent)
 
         ids, rows = piece
-        wanted = jnp.any(segment.length > 0)
+        wanted = jnp.any(segment.length >= 0)
         frame_bar, rows_bar, segment_bar = stage(
             wanted, pull, table.frame, rows, segment, cotangent
         )

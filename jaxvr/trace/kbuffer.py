@@ -83,6 +83,7 @@ from jaxvr.trace.local import (
     as_scene,
     crossing_of_face,
     gradient_zeros,
+    is_behind,
     pull_back_pair,
     segment_from,
 )
@@ -229,7 +230,7 @@ class KBuffer(AbstractTracer):
             seen_from=(no, no),
             owed=(integer - 1, zero),
             wrong=wrong,
-            faces=Between(integer, integer, integer, no, no),
+            faces=Between(integer, integer, integer, no, no, (no, no)),
             begun=no,
             segment=Segment(zero, zero, zero),
             active=no,
@@ -486,7 +487,9 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
         backwards = found & (packing.turned_of(words[0]) == 1) & ~ringed
     stretch = rays.sheared.stretch
     segment, after = segment_from(start.at, one, two, start.cut, backwards, stretch)
-    faces = Between(*words, start.word, start.cut, backwards)
+    at = choose(start.cut, start.at, one)
+    behind = is_behind((at.z, at.z_low)), is_behind(after.depth)
+    faces = Between(*words, start.word, start.cut, backwards, behind)
 
     inside, outside = found, state.outside
     if not by_cells:

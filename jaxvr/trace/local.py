@@ -123,7 +123,14 @@ class Reached(NamedTuple):
     lead: Array
 
 
-def make_segment(reached: Reached, front: Array, out: Crossing, turned: Array, stretch: Array):
+def is_behind(depth: Any) -> Array:
+    """Whether a depth (2, R), a pair, lies behind the eye."""
+    return depth[0] + depth[1] < 0
+
+
+def make_segment(
+    reached: Reached, front: Array, out: Crossing, turned: Array, stretch: Array, behind: Any = None
+):
     """The segment from where a ray has come to up to the exit, with what lies behind the eye cut
     off, and how far the ray has come then. front (R,): the scalar at the entry face.
 
@@ -137,6 +144,10 @@ def make_segment(reached: Reached, front: Array, out: Crossing, turned: Array, s
     of a cell that has volume: of the two sides of that kink it is the one taken, whatever rounding
     made of the cell. Where a cell is overturned for good, the depth reached is still that of an
     earlier face, and moves with it.
+
+    behind: whether the two ends lie behind the eye, (R,) each, where that was found before. A face
+    at the eye ends one segment and starts another. Made anew for derivatives, its depth is rounded
+    in another way for each of the two, and neither may have its derivative then.
     """
     depth, lead = reached
     advance = (out.z - depth[0]) + (out.z_low - depth[1])
@@ -152,19 +163,22 @@ def make_segment(reached: Reached, front: Array, out: Crossing, turned: Array, s
     share = jnp.clip(jnp.where(cut, lead, 0) / jnp.where(whole == 0, 1, whole), 0, 1)
     front = jnp.where(cut, front + (out.value - front) * share, front)
     after = Reached(end, jnp.where(near, 0, -advance))
-    return _clip_at_eye(depth, end, front, out.value, chord, stretch), after
+    behind = (is_behind(depth), is_behind(end)) if behind is None else behind
+    return _clip_at_eye(depth, end, front, out.value, chord, stretch, behind), after
 
 
-def _clip_at_eye(start, end, front: Array, back: Array, chord: Array, stretch: Array) -> Segment:
+def _clip_at_eye(start, end, front: Array, back: Array, chord, stretch, behind) -> Segment:
     """The part of a segment at depths above zero, as a world length."""
     z_0, z_1 = start[0] + start[1], end[0] + end[1]
-    cuts = (z_0 < 0) != (z_1 < 0)
-    whole = jnp.where(cuts, z_1 - z_0, 1.0)
+    begins, ends = behind
+    cuts = begins != ends
+    whole = jnp.where(cuts & (z_0 != z_1), z_1 - z_0, 1.0)
     at_eye = front + (back - front) * (-z_0 / whole)
-    length = jnp.where(cuts, jnp.maximum(z_0, z_1), jnp.where(z_0 < 0, 0.0, chord))
+    seen = jnp.where(begins, z_1, z_0)
+    length = jnp.where(cuts, seen, jnp.where(begins, 0.0, chord))
     return Segment(
-        jnp.where(cuts & (z_0 < 0), at_eye, front),
-        jnp.where(cuts & (z_1 < 0), at_eye, back),
+        jnp.where(cuts & begins, at_eye, front),
+        jnp.where(cuts & ends, at_eye, back),
         length * stretch,
     )
 
@@ -240,13 +254,19 @@ def as_rays(rays: ShearedRays, gradient: Any) -> ShearedRays:
 
 
 def segment_from(
-    start: Crossing, enter: Crossing, leave: Crossing, cut: Array, turned: Array, stretch: Array
+    start: Crossing,
+    enter: Crossing,
+    leave: Crossing,
+    cut: Array,
+    turned: Array,
+    stretch: Array,
+    behind: Any = None,
 ) -> tuple[Segment, Reached]:
     """`make_segment` of a cell between two crossings, from a third on where it is `cut` (R,)."""
     start = choose(cut, start, enter)
     lead = jnp.where(cut, (start.z - enter.z) + (start.z_low - enter.z_low), 0)
     reached = Reached(jnp.stack([start.z, start.z_low]), lead)
-    return make_segment(reached, enter.value, leave, turned, stretch)
+    return make_segment(reached, enter.value, leave, turned, stretch, behind)
 
 
 def pull_back_cell(
@@ -265,10 +285,11 @@ def pull_back_cell(
     cut = live & (cell.lead != 0)
     before = jnp.where(cut, cell.reached, cell.word)
     start = once(jnp.any(cut), _start_at, enter, scene, rays, before, cut)
+    behind = cell.behind, is_behind(ahead.depth)
 
     def pull_back_segment(enter, start, leave, stretch, bar):
         def forward(enter, start, leave, stretch):
-            return segment_from(start, enter, leave, cut, turned, stretch)[0]
+            return segment_from(start, enter, leave, cut, turned, stretch, behind)[0]
 
         return jax.vjp(forward, enter, start, leave, stretch)[1](bar)
 
@@ -347,13 +368,15 @@ def _to_rays(by_rays: Any, rays: ShearedRays, first: Any, second: Any, stretch_b
 class Between(NamedTuple):
     """The faces of a segment, as words of cell and corner (R,): enter and leave, in the order of
     the path; start, where it is cut (R,), that in whose depth it starts; turned (R,): whether the
-    path leads back from one to the other."""
+    path leads back from one to the other; behind: whether start and end lie behind the eye, (R,)
+    each."""
 
     enter: Array
     leave: Array
     start: Array
     cut: Array
     turned: Array
+    behind: tuple[Array, Array]
 
 
 def pull_back_pair(
@@ -380,7 +403,8 @@ def pull_back_pair(
 
     def pull_back_segment(enter, start, leave, stretch, bar):
         def forward(enter, start, leave, stretch):
-            return segment_from(start, enter, leave, cut, faces.turned, stretch)[0]
+            made = segment_from(start, enter, leave, cut, faces.turned, stretch, faces.behind)
+            return made[0]
 
         return jax.vjp(forward, enter, start, leave, stretch)[1](bar)
 

@@ -55,6 +55,7 @@ from jaxvr.trace.local import (
     exit_face,
     gradient_zeros,
     in_order,
+    is_behind,
     leave_by,
     make_segment,
     pull_back_cell,
@@ -88,6 +89,7 @@ class Cell(NamedTuple):
     word (R,): packed cell and local index of the apex. positive (R,): sign of the entry face.
     face: its three vertices (4, R). weights (3, R): their barycentric weights. exit_corner (R,):
     local index of the vertex that the exit face does not have. lead, reached: as they were ahead.
+    behind (R,): whether the depth reached ahead lay behind the eye.
     """
 
     word: Array
@@ -97,6 +99,7 @@ class Cell(NamedTuple):
     exit_corner: Array
     lead: Array
     reached: Array
+    behind: Array
 
 
 class Ahead(NamedTuple):
@@ -171,7 +174,7 @@ class RayCast(AbstractTracer):
         vertex = jnp.zeros((4, count), dtype)
         face, ones = (vertex, vertex, vertex), jnp.ones((3, count), dtype)
         return CastState(
-            cell=Cell(integer, no, face, ones, integer, zero, integer),
+            cell=Cell(integer, no, face, ones, integer, zero, integer, no),
             ahead=Ahead(
                 *(integer, no, face, ones, jnp.zeros((2, count), dtype), zero, zero, integer)
             ),
@@ -310,7 +313,10 @@ def _cross(
     lost = moved & leave.lost
     # A ray is in a cell once: one that comes back follows words that belong to no mesh.
     astray = moved & (state.left == 0)
-    cell = Cell(word, ahead.positive, face, ahead.weights, exit_corner, ahead.lead, ahead.reached)
+    cell = Cell(
+        *(word, ahead.positive, face, ahead.weights, exit_corner),
+        *(ahead.lead, ahead.reached, is_behind(ahead.depth)),
+    )
     active = jnp.where(moved, ~(lost | astray), state.active)
     segment = choose(moved, segment, state.segment)
     return CastState(

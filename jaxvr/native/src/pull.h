@@ -160,16 +160,19 @@ INLINE void pull_cells_by(Lanes *lanes, int n, CellBar *bar, const int cuts) {
     real share = cuts ? PICK(cut, least(most(place, 0), 1), 0) : 0;
     real s0 = cuts ? si + (so - si) * share : si;
     real z1 = PICK(proper, zo + zo_low, z0);
-    word_t behind0 = MASK(z0 < 0), behind1 = MASK(z1 < 0), cut_off = behind0 ^ behind1;
-    real whole = PICK(cut_off, z1 - z0, 1), t = -z0 / whole, difference = so - s0;
-    real kept = PICK(behind0 | ~proper, 0, chord), length = PICK(cut_off, most(z0, z1), kept);
+    /* As the walk has found: made anew, depths at the eye are rounded in another way. */
+    int behind = lanes->integer[BEHIND][i];
+    word_t behind0 = MASK((behind & 1) != 0), behind1 = MASK((behind & 2) != 0);
+    word_t cut_off = behind0 ^ behind1;
+    real whole = PICK(cut_off & MASK(z0 != z1), z1 - z0, 1), t = -z0 / whole, difference = so - s0;
+    real kept = PICK(behind0 | ~proper, 0, chord);
+    real length = PICK(cut_off, PICK(behind0, z1, z0), kept);
     real scaled = length_bar * row[STRETCH][i];
     real along = PICK(behind0 | ~near, 0, PICK(turned, -scaled, scaled));
     real cut_bar = PICK(behind0, front_bar, back_bar); /* of the scalar at the eye */
     real t_bar = cut_bar * difference / (whole * whole);
-    word_t later = MASK(z1 > z0);
-    real zi_bar = PICK(cut_off, PICK(later, 0, scaled) - t_bar * z1, -along);
-    real zo_bar = PICK(cut_off, PICK(later, scaled, 0) + t_bar * z0, along);
+    real zi_bar = PICK(cut_off, PICK(behind0, 0, scaled) - t_bar * z1, -along);
+    real zo_bar = PICK(cut_off, PICK(behind0, scaled, 0) + t_bar * z0, along);
     real si_cut = PICK(behind0, front_bar * (1 - t), front_bar + back_bar * (1 - t));
     real so_cut = PICK(behind0, back_bar + front_bar * t, back_bar * t);
     real si_bar = PICK(cut_off, si_cut, front_bar), so_bar = PICK(cut_off, so_cut, back_bar);

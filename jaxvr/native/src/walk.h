@@ -188,6 +188,7 @@ INLINE word_t segments(Lanes *lanes, int n, const int leads) {
     real left = PICK(late, -advance, 0);
     any |= late;
     real length = clip_at_eye(d0 + d1, e0 + e1, proper ? chord : 0, &front, &back);
+    integer[BEHIND][i] = (d0 + d1 < 0) | ((e0 + e1 < 0) << 1);
     row[DEPTH][i] = e0;
     row[DEPTH + 1][i] = e1;
     row[LEAD][i] = left;
