@@ -12,14 +12,14 @@ from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # One thread compiles a function: with a worker on each core, dividing the work only costs.
-FLAGS = ["--xla_cpu_parallel_codegen_split_count=1", os.environ.get("XLA_FLAGS", "")]
-# Without LLVM's optimiser (see the Makefile) XLA's emitters by way of MLIR would take half of the
-# time. It has older ones until jaxlib 0.10, and ends the process over a flag that it does not know.
-if "--xla_backend_optimization_level=0" in FLAGS[1] and version("jaxlib").startswith(
-    ("0.7.", "0.8.", "0.9.", "0.10.")
-):
-    FLAGS.insert(0, "--xla_cpu_use_fusion_emitters=false")
-os.environ["XLA_FLAGS"] = " ".join(FLAGS)
+os.environ["XLA_FLAGS"] = " ".join(
+    ("--xla_cpu_parallel_codegen_split_count=1", os.environ.get("XLA_FLAGS", ""))
+)
+# Without LLVM's optimiser (see the Makefile), XLA's emitters by way of MLIR take half of the time.
+# There are older ones until jaxlib 0.10. (A flag that XLA does not know ends the process.)
+if "--xla_backend_optimization_level=0" in os.environ["XLA_FLAGS"]:
+    if version("jaxlib").startswith(("0.7.", "0.8.", "0.9.", "0.10.")):
+        os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
 # What one process of a run has compiled, the others need not: the workers of pytest-xdist, the
 # processes that tests start, and tests that clear JAX's own caches. The folder lives as long as the
 # run, and its files' talk of processors, which nobody asked for, is switched off.
