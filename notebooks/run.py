@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 FOLDER = Path(__file__).resolve().parent
-SMALL = {"SIZE": 32, "ITERATIONS": 4}
+SMALL = {"SIZE": 32, "ITERATIONS": 4, "CELLS": (4, 14, 2), "FEWER": (2,)}
 # What a notebook may weigh, with its pictures.
 BYTES = 3_000_000
 # What a cell may take, on two cores.
@@ -32,7 +32,7 @@ def notebooks() -> list[Path]:
 def smaller(code: str) -> str:
     """The code of the cell with parameters, with those of tests."""
     for name, value in SMALL.items():
-        code = re.sub(rf"^{name} = \S+", f"{name} = {value}", code, flags=re.M)
+        code = re.sub(rf"^{name} = .*?(?=  #|$)", f"{name} = {value}", code, flags=re.M)
     return code
 
 

@@ -7,6 +7,7 @@ import gc
 import os
 import shutil
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -14,6 +15,11 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ["XLA_FLAGS"] = " ".join(
     ("--xla_cpu_parallel_codegen_split_count=1", os.environ.get("XLA_FLAGS", ""))
 )
+# Without LLVM's optimiser (see the Makefile), XLA's emitters by way of MLIR take half of the time.
+# There are older ones until jaxlib 0.10. (A flag that XLA does not know ends the process.)
+if "--xla_backend_optimization_level=0" in os.environ["XLA_FLAGS"]:
+    if version("jaxlib").startswith(("0.7.", "0.8.", "0.9.", "0.10.")):
+        os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
 # What one process of a run has compiled, the others need not: the workers of pytest-xdist, the
 # processes that tests start, and tests that clear JAX's own caches. The folder lives as long as the
 # run, and its files' talk of processors, which nobody asked for, is switched off.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import warnings
 
 import jax
 import numpy as np
@@ -21,8 +22,19 @@ SIZE = 8
 
 @functools.cache
 def fins():
-    """Not convex, with gaps that rays cross."""
-    return datasets.heat_sink(fins=2, dtype="float64")
+    """A comb of three teeth, 720 cells: not convex, with gaps that rays cross, and with more faces
+    than are looked through, or covered, at once."""
+    box = datasets.box((9, 4, 4), jitter=0.2, dtype="float64", field=lambda p: p @ [0.5, 0.3, 0.2])
+    points, cells = np.asarray(box.points), np.asarray(box.cells)
+    column, row, _ = (points[cells].mean(1) * [9, 4, 4]).astype(int).T
+    kept = ~(np.isin(column, (2, 6)) & (row > 0))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*inverted")  # rows are sorted, not oriented
+        mesh = jaxvr.TetMesh.from_cells(
+            points, {"tetra": cells[kept]}, np.asarray(box.values), dtype="float64"
+        )
+    assert mesh.n_tets == 720 and 2 * mesh.n_tets > max(select.LOOK * select.BLOCK, cover.GROUP)
+    return mesh
 
 
 @functools.cache
