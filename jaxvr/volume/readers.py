@@ -203,6 +203,13 @@ def read_mesh(
     Values at the corners of cells that are no tetrahedra come as point data on points of each
     cell's own, which are welded.
 
+    Readers run in a process of their own, so that what they print, ask for or crash does not reach
+    the caller's. Inside of an application whose `sys.executable` is no Python (one frozen by
+    PyInstaller, or that embeds Python and has none beside) they run in the caller's, as the first
+    time a warning says: there is no limit of memory and time, what readers print goes to its
+    streams, VTK's messages pass by its window meanwhile, and a crash ends it.
+    `multiprocessing.set_executable` says which Python to start instead.
+
     Raises FileNotFoundError where there is no file, OSError where the disk fails, and ValueError
     for a file that is damaged, of a kind that is not supported or known, in need of a package,
     larger than the limit, that has not this field, step or block (with those it has), whose cells

@@ -45,12 +45,14 @@ class Field(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Ask:
     """step: which time step (an index, or a time as a float); block: names or places of blocks;
-    limit: bytes of memory, or None; vtk: whether VTK's readers may be taken."""
+    limit: bytes of memory, or None; vtk: whether VTK's readers may be taken; alone: whether the
+    process does nothing but read files, so that it may be ended and what VTK prints is known."""
 
     step: int | float | None = None
     block: Any = None
     limit: int | None = None
     vtk: bool = True
+    alone: bool = True
 
 
 @dataclasses.dataclass

@@ -7,11 +7,12 @@ the file is what is read.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import re
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -78,20 +79,24 @@ def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
         ):
             getattr(reader, f"ReadAll{what}On")()
     if suffix == ".dat":
+        if not ask.alone:
+            raise Trouble("unsupported", f"{name} may wait for ever, and cannot be ended here")
         _require_soon(2 + path.stat().st_size / 5e5)
-    reader.UpdateInformation()
-    steps = _times(reader)
-    _switch_on(reader, suffix)
-    step = None
-    if steps:
-        step = pick_step(steps, ask.step)
-        reader.UpdateTimeStep(steps[step])
-    else:
-        reader.Update()
+    with _heard(ask.alone) as heard:
+        reader.UpdateInformation()
+        steps = _times(reader)
+        _switch_on(reader, suffix)
+        step = None
+        if steps:
+            step = pick_step(steps, ask.step)
+            reader.UpdateTimeStep(steps[step])
+        else:
+            reader.Update()
+        told = heard()
     if suffix == ".dat" and hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_PROF, 0)
     data = reader.GetOutputDataObject(0)
-    told = " ".join(said().split())
+    told = " ".join((told + said()).split())
     found = _TROUBLE.search(told)
     if found:
         raise Trouble("damaged", f"{name}: {_plain(told[found.start() :])}")
@@ -106,6 +111,23 @@ def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
     return content
 
 
+@contextlib.contextmanager
+def _heard(alone: bool) -> Iterator[Callable[[], str]]:
+    """What VTK says meanwhile, where this process is the caller's and its streams are left alone:
+    a window of VTK's takes it, in the place of the caller's."""
+    if alone:
+        yield lambda: ""
+        return
+    from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
+
+    window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
+    vtkOutputWindow.SetInstance(window)
+    try:
+        yield window.GetOutput
+    finally:
+        vtkOutputWindow.SetInstance(before)
+
+
 def _require_soon(seconds: float) -> None:
     """VTK's Tecplot reader waits for ever for what a file cut short does not have: it gets less
     time than others, after which this process is ended."""
@@ -117,6 +139,7 @@ def _require_soon(seconds: float) -> None:
 def _plain(told: str) -> str:
     """VTK's messages without time stamps, addresses and places in its source."""
     told = re.sub(r"\(\s*[0-9.]+s\)\s*\[[^\]]*\]\s*", "", told)
+    told = re.sub(r"(ERROR|Warning): In \S+\.cxx, line \d+", "", told)
     told = re.sub(r"\S+\.cxx:\d+\s*(ERR|WARN)\|\s*", "", told)
     told = re.sub(r"\((?:0x)?[0-9a-f]{6,}\)", "", told)
     return told[:300]
