@@ -275,9 +275,12 @@ def write_mesh(path: Any, mesh: TetMesh) -> None:
     has the same faces and the same picture. The field has the name it was read by, or "values".
 
     The file is there as a whole or not at all: it is made beside its place, synced and then moved
-    over what was there. Raises FileNotFoundError where there is no such folder, OSError where the
-    disk is full or may not be written, and ValueError for a name whose format meshio does not know
-    or cannot write this in.
+    over what was there. Through a link the file that it leads to is written, in the format of the
+    link's name, or of that file's where the link has no suffix.
+
+    Raises FileNotFoundError where there is no such folder, OSError where the disk is full or may
+    not be written, and ValueError for a name whose format meshio does not know or cannot write this
+    in.
     """
     file = _path(path)
     points = np.asarray(mesh.points)
@@ -304,6 +307,7 @@ def write_mesh(path: Any, mesh: TetMesh) -> None:
         process.run(
             "write", None, None, path=str(place), points=points, tets=tets.astype(np.int64),
             name=name, values=values, location=location, workshop=str(workshop),
+            suffix=file.suffix or place.suffix,
         )  # fmt: skip
     except Trouble as e:
         shutil.rmtree(workshop, ignore_errors=True)

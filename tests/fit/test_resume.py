@@ -418,7 +418,8 @@ def test_what_a_killed_writer_left_is_removed(tmp_path):
     for file in (left, alive, other):
         file.write_bytes(b"part")
     writing.require_place(path, "The checkpoint")
-    assert sorted(tmp_path.iterdir()) == sorted([alive, other])
+    kept = [alive, other] if os.name == "posix" else [left, alive, other]  # see `_sweep`
+    assert sorted(tmp_path.iterdir()) == sorted(kept)
 
 
 def test_links_stay_links_and_modes_stay(tmp_path):

@@ -364,6 +364,33 @@ def test_what_was_there_stays_where_writing_fails(tmp_path):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("link", "real"),
+    [
+        ("a.vtu", "store"), ("a", "real.vtu"), ("a", "sub/real.vtk"), ("a.vtk", "store.tmp"),
+        ("a.vtk", "real.vtu"), ("a.mesh", "x.y"),
+    ],
+)  # fmt: skip
+def test_links_to_names_with_other_suffixes(link, real, tmp_path):
+    """The link's suffix says the format, or else that of the file that it leads to."""
+    mesh = datasets.box((1, 1, 1), field=lambda p: p[:, 0])
+    (tmp_path / "sub").mkdir()
+    (tmp_path / link).symlink_to(tmp_path / real)
+    for _ in range(2):  # the file is made, and replaced
+        if link.endswith(".mesh"):  # holds no such field
+            with pytest.raises(ValueError, match="cannot be written"):
+                write_mesh(tmp_path / link, mesh)
+            assert not (tmp_path / real).exists()
+            continue
+        write_mesh(tmp_path / link, mesh)
+        assert (tmp_path / link).is_symlink() and (tmp_path / real).is_file()
+        head = (tmp_path / real).read_bytes()[:30]
+        vtu = (link if "." in link else real).endswith("vtu")
+        assert (b"<VTKFile" if vtu else b"# vtk DataFile") in head
+        assert np.array_equal(read_mesh(tmp_path / link).values, mesh.values)
+    assert not list(tmp_path.rglob(".*"))
+
+
 def test_cells_of_another_size_than_their_type(tmp_path):
     """As in a public file that came out with a third of its volume."""
     (tmp_path / "a.vtk").write_text(
@@ -563,6 +590,6 @@ def test_a_mesh_that_may_not_be_written_stays(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda p, mode: access(p, mode) and mode != os.W_OK)
     mesh = np.eye(4)[:, :3], np.arange(4)[None], "s", np.arange(4.0), "point"
     with pytest.raises(Trouble) as caught:
-        write.write(str, str(place), *mesh, str(tmp_path / "workshop"))
+        write.write(str, str(place), *mesh, str(tmp_path / "workshop"), ".vtu")
     assert caught.value.kind == "system" and str(errno.EACCES) in caught.value.message
     assert place.read_bytes() == before and list(tmp_path.iterdir()) == [place]
