@@ -160,10 +160,16 @@ def list_fields(path: Any, *, max_memory: Any = _DEFAULT) -> list[Field]:
     """The fields of the mesh file at `path`, point data first.
 
     Each is a named tuple of its name, location ("point", "cell" or "corner"), number of components,
-    the names of the blocks that have it (where the file has several) and the times of its steps
-    (where it has several). `path`, `max_memory` and errors are those of `read_mesh`.
+    the names of the blocks that have it (where the file has several) and the times of the steps
+    that have it (where the file has several). Of a .pvd or .series file all steps are looked at;
+    where that takes reading more than 20 of them as a whole, a warning says which were not.
+    `path`, `max_memory` and errors are those of `read_mesh`.
     """
-    return _run("fields", _existing(path), max_memory, None, None)
+    file = _existing(path)
+    found, notes = _run("fields", file, max_memory, None, None)
+    for note in notes:
+        warnings.warn(f"{file.name}: {note}", UserWarning, stacklevel=2)
+    return found
 
 
 def read_mesh(

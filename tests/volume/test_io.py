@@ -567,6 +567,14 @@ def test_gmsh_entities_in_several_groups(tmp_path):
     )
     for block in ("one", "two"):
         assert read_mesh(tmp_path / "a.msh", block=block, values=np.zeros(4)).n_tets == 1
+    with open(tmp_path / "a.msh", "a") as f:
+        f.write(STEP.format(t=0.0, k=0, v=1).replace("\n5\n10", "\n4\n10"))
+    text = (tmp_path / "a.msh").read_text()
+    for k, node in enumerate(("10 ", "20 ", "30 ", "2147483647 ")):
+        text = text.replace(f"\n{node}1", f"\n{k + 1} 1")
+    (tmp_path / "a.msh").write_text(text.replace("50 1\n", ""))
+    (field,) = list_fields(tmp_path / "a.msh")
+    assert field == Field("temp", "point", 1, ("one", "two"))
 
 
 def test_a_forked_process_closes_what_it_got(tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 from .content import Content, Trouble
 
@@ -27,6 +28,7 @@ _RATIO = {
 _PARTS = {".pvd", ".series", ".pvtu", ".pvti", ".pvtr", ".pvts", ".vtm", ".vtmb", ".vtpd", ".vtpc",
           ".case", ".encas", ".xdmf", ".xmf", ".foam"}  # fmt: skip
 Counts = dict[str, int]
+COUNTED = (".vtu", ".vtk", ".pvtu", ".vtm")  # whose headers tell what has to come out
 
 
 def volume_of(path: Path, suffix: str) -> int:
@@ -63,6 +65,8 @@ def claims(path: Path, suffix: str) -> Counts:
         return _vtu(path, size)
     if suffix == ".vtk":
         return _legacy(path, size)
+    if suffix in (".pvtu", ".vtm"):
+        return _listed(path, suffix)
     if suffix == ".ugrid":
         return _ugrid(path, size)
     return {}
@@ -98,6 +102,25 @@ def _vtu(path: Path, size: int) -> Counts:
             found[what] += int(m[1]) if m else 0
     _bound(found["points"], "points", 6 / ratio, size)
     _bound(found["cells"], "cells", 4 / ratio, size)
+    return found
+
+
+def _listed(path: Path, suffix: str) -> Counts:
+    """The sum over the .vtu files that a file lists; nothing where there are others among them."""
+    tag, key = ("Piece", "Source") if suffix == ".pvtu" else ("DataSet", "file")
+    try:
+        entries = ElementTree.fromstring(path.read_bytes()).iter(tag)
+        files = [path.parent / e.attrib[key] for e in entries if e.get(key)]
+    except ElementTree.ParseError:
+        return {}  # its reader says what is wrong
+    if any(file.suffix != ".vtu" for file in files):
+        return {}
+    found: Counts = {"points": 0, "cells": 0}
+    for file in files:
+        if not file.is_file():
+            raise Trouble("damaged", f"it names {file.name!r}, which is not there")
+        for what, n in _vtu(file, file.stat().st_size).items():
+            found[what] += n
     return found
 
 
