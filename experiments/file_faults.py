@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 import jaxvr
-from experiments import file_makers
+from experiments import file_formats
 
 SOURCES = (
     "VTU, ascii", "VTU, appended raw", "VTU, zlib", "VTU, LZ4", "VTU, several pieces",
@@ -107,7 +107,7 @@ def mutants(count: int, seed: int) -> dict[str, Any]:
     slowest = (0.0, "")
     with tempfile.TemporaryDirectory() as root:
         sources = []
-        for kind in file_makers.KINDS:
+        for kind in file_formats.KINDS:
             if kind.name not in SOURCES:
                 continue
             place = Path(root) / f"{len(sources)} {kind.name}".replace("/", " ")

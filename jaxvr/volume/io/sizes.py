@@ -154,9 +154,10 @@ def _ugrid(path: Path, size: int) -> Counts:
     with open(path, "rb") as f:
         head = f.read(4096)
     try:
-        if m := re.fullmatch(r"\.(l?)(?:b|r)(4|8)l?", kind):
-            at = 4 if ".r" in kind or kind.startswith(".lr") else 0
-            numbers = np.frombuffer(head, "<i4" if m[1] else ">i4", 7, at).tolist()
+        if m := re.fullmatch(r"\.(l?)(b|r)(?:4|8)(l?)", kind):
+            width = 8 if m[3] else 4
+            at = width if m[2] == "r" else 0
+            numbers = np.frombuffer(head, f"{'<' if m[1] else '>'}i{width}", 7, at).tolist()
             least = 4
         else:
             words = re.sub(rb"np\.\w+\(([^()]*)\)", rb"\1", head).split()  # by NumPy 2
@@ -165,4 +166,4 @@ def _ugrid(path: Path, size: int) -> Counts:
         raise Trouble("damaged", "its seven counts cannot be read") from None
     for n, what in zip(numbers, ("points", "triangles", "quads", "tetra", "pyramids", "wedges", "hexahedra")):  # noqa: E501  # fmt: skip
         _bound(n, what, 3 * least if what == "points" else least, size)
-    return {}
+    return {"points": numbers[0], "cells": sum(numbers[1:])} if len(numbers) == 7 else {}
