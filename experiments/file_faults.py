@@ -43,7 +43,9 @@ SOURCES = (
     "XDMF, numbers in the XML", "XDMF, time series", "Abaqus", "Nastran", "Medit", "SU2",
     "UGRID, little endian", "AVS-UCD", "Tecplot, hexahedra", "FLAC3D", "DOLFIN XML", "Netgen",
     "gmsh 2.2, ascii", "gmsh 2.2, binary", "gmsh 4.1, ascii", "gmsh 4.1, binary",
-    "gmsh, data at the corners of elements", "Exodus, blocks, steps, TETRA4", "MED", "CGNS by gmsh",
+    "gmsh, data at the corners of elements", "MED", "CGNS by gmsh",
+    "Exodus, classic, a field on one of two blocks", "XDMF, mixed cells in the XML, by hand",
+    "UGRID, text, by hand", "UGRID, Fortran records",
 )  # fmt: skip
 
 
@@ -103,6 +105,8 @@ def outcome(path: Path, how: dict[str, Any]) -> str:
 
 def mutants(count: int, seed: int) -> dict[str, Any]:
     rng = random.Random(seed)
+    if unknown := set(SOURCES) - {kind.name for kind in file_formats.KINDS}:
+        raise ValueError(f"There are no kinds {sorted(unknown)}.")
     found: collections.Counter[str] = collections.Counter()
     slowest = (0.0, "")
     with tempfile.TemporaryDirectory() as root:

@@ -26,6 +26,7 @@ from . import connectivity as conn
 from .geometry import flat_cells, signed_volumes
 from .packing import MAX_CELLS
 from .report import MeshReport, collapse
+from .unused import gathered
 from .weld import weld
 
 # comparators of a sorting network for four keys
@@ -282,6 +283,7 @@ def build(points: Any, cells: Any, dtype: Any, field: str | None = None) -> Buil
     """Everything but the values. Raises ValueError as `TetMesh.from_cells` says."""
     pts = read_points(points, dtype)
     blocks, reduced, ignored = read_blocks(cells, len(pts))
+    pts = gathered(pts, [b.corners for b in blocks])
     welded, duplicates = weld(pts)
 
     tets, parent, sizes, sign, start = [], [], [], [], 0
