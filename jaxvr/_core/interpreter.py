@@ -7,6 +7,7 @@ application again.
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from pathlib import Path
@@ -27,7 +28,7 @@ def python() -> str | None:
         "multiprocessing.spawn"
     )  # who has not imported it has told nothing
     told = spawn and spawn.get_executable()
-    told = told.decode(errors="surrogateescape") if isinstance(told, bytes) else told
+    told = os.fsdecode(told) if told else None
     if told and told != sys.executable:
         return told
     if getattr(sys, "frozen", False):
