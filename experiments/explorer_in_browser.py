@@ -1,11 +1,14 @@
-"""`jaxvr.explore` in JupyterLab, driven in a browser: the picture is dragged, then a control point.
+"""`jaxvr.explore` in JupyterLab, driven in a browser: the picture is dragged, then a control point,
+then buttons are pressed.
 
     python -m experiments.explorer_in_browser [--out notebooks] [--dark] [--window FILE]
 
 starts JupyterLab on this machine only, opens a notebook in Chromium without a display, runs it and
-takes screenshots before, after a drag of the picture and after a drag of a control point. Prints
-what part of the picture each changed and how long coarse and exact frames took; exit status 1 if a
-drag changed nothing. Needs jupyterlab, anywidget and selenium, Chromium and its driver.
+takes screenshots before, after a drag of the picture and after a drag of a control point. Then it
+presses every button for a view and for the axis that is up. Prints what part of the picture each
+changed, what the lines of the widget say, and how long coarse and exact frames took; exit status 1
+if something changed nothing or the lines do not say where the view is. Needs jupyterlab, anywidget
+and selenium, Chromium and its driver.
 """
 
 from __future__ import annotations
@@ -36,6 +39,8 @@ FLAGS = (
     "--disable-background-networking --disable-component-update --disable-sync "
     "--window-size=1100,1250"
 ).split()
+VIEWS = ("front", "right", "back", "left", "top", "bottom")
+UPS = ("x", "y", "z", "−x", "−y", "−z")
 WAIT = 120.0  # seconds for a first picture, with compiling
 
 
@@ -155,6 +160,19 @@ class Page:
     def find(self, selector: str) -> Any:
         return self.driver.find_elements("css selector", f".jaxvr-explorer {selector}")
 
+    def press(self, text: str) -> tuple[np.ndarray, str, list[str]]:
+        """Presses the button with that text: the exact picture after it, the line that says where
+        it is seen from, and the buttons that are shown as pressed."""
+        (button,) = (b for b in self.find("button[aria-pressed]") if b.text == text)
+        button.click()
+        picture = self.exact()
+        pressed = [b.text for b in self.find("button[aria-pressed=true]")]
+        return picture, self.lines()[0], pressed
+
+    def lines(self) -> list[str]:
+        """What the widget says of its view, and of its transfer function."""
+        return [self.find(".row span")[0].text, self.find(".told")[0].text]
+
     def ready(self) -> bool:
         """Whether the kernel is there; answers JupyterLab's question which one to take.
 
@@ -215,6 +233,7 @@ def run(
         seconds = time.monotonic() - start
         driver.execute_script("arguments[0].scrollIntoView()", page.find("canvas")[0])
         page.save(out / "explorer_before.png")
+        lines = page.lines()
         page.quicken()
         page.drag(page.find("canvas")[0], [(8, 3)] * 25)
         after = page.exact()
@@ -222,6 +241,12 @@ def run(
         page.drag(page.find(".point")[2], [(0, -2)] * 25)
         recolored = page.exact()
         page.save(out / "explorer_transfer.png")
+        edited = page.lines()[1]
+        buttons, last = {}, recolored
+        for text in (*VIEWS, *UPS):
+            picture, line, pressed = page.press(text)
+            buttons[text] = {"line": line, "pressed": pressed, "changed": changed(last, picture)}
+            last = picture
         if window is not None:
             driver.save_screenshot(str(window))
         errors = [e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"]
@@ -229,6 +254,9 @@ def run(
         "seconds_to_first_exact": round(seconds, 2),
         "changed_by_camera": changed(before, after),
         "changed_by_transfer": changed(after, recolored),
+        "lines": lines,
+        "line_after_edit": edited,
+        "buttons": buttons,
         "coarse_ms": page.milliseconds("coarse"),
         "exact_ms": page.milliseconds("exact"),
         "statuses": page.seen,
@@ -260,6 +288,27 @@ def main() -> None:
     print(json.dumps(report, indent=1, ensure_ascii=False))
     if min(report["changed_by_camera"], report["changed_by_transfer"]) < 0.01:
         sys.exit("A drag did not change the picture.")
+    if wrong := wrongs(report):
+        sys.exit("; ".join(wrong))
+
+
+def wrongs(report: dict[str, Any]) -> list[str]:
+    """What the widget does not say or does not do, of the report that `run` gives."""
+    found = []
+    view, told = report["lines"]
+    if " up, which shows most" not in view:
+        found.append(f"The axis that was chosen is not told: {view!r}.")
+    if "quantiles" not in told or report["line_after_edit"]:
+        found.append(f"What the transfer function spans is not told: {told!r}.")
+    for text, seen in report["buttons"].items():
+        from_axis = text not in VIEWS or " from " in seen["line"]
+        up = text not in UPS or seen["line"].startswith(f"{text.replace('−', '-')} up")
+        if not (text in seen["pressed"] and from_axis and up):
+            found.append(f"Button {text}: the widget says {seen['line']!r}, {seen['pressed']}.")
+        # "x" may be up already, and the heat sink is the same from above and from below.
+        if text not in (UPS[0], "bottom") and not seen["changed"] > 0:
+            found.append(f"Button {text} did not change the picture.")
+    return found
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 import jaxvr
-from experiments import file_makers
+from experiments import file_formats
 
 SOURCES = (
     "VTU, ascii", "VTU, appended raw", "VTU, zlib", "VTU, LZ4", "VTU, several pieces",
@@ -43,7 +43,9 @@ SOURCES = (
     "XDMF, numbers in the XML", "XDMF, time series", "Abaqus", "Nastran", "Medit", "SU2",
     "UGRID, little endian", "AVS-UCD", "Tecplot, hexahedra", "FLAC3D", "DOLFIN XML", "Netgen",
     "gmsh 2.2, ascii", "gmsh 2.2, binary", "gmsh 4.1, ascii", "gmsh 4.1, binary",
-    "gmsh, data at the corners of elements", "Exodus, blocks, steps, TETRA4", "MED", "CGNS by gmsh",
+    "gmsh, data at the corners of elements", "MED", "CGNS by gmsh",
+    "Exodus, classic, a field on one of two blocks", "XDMF, mixed cells in the XML, by hand",
+    "UGRID, text, by hand", "UGRID, Fortran records",
 )  # fmt: skip
 
 
@@ -103,11 +105,13 @@ def outcome(path: Path, how: dict[str, Any]) -> str:
 
 def mutants(count: int, seed: int) -> dict[str, Any]:
     rng = random.Random(seed)
+    if unknown := set(SOURCES) - {kind.name for kind in file_formats.KINDS}:
+        raise ValueError(f"There are no kinds {sorted(unknown)}.")
     found: collections.Counter[str] = collections.Counter()
     slowest = (0.0, "")
     with tempfile.TemporaryDirectory() as root:
         sources = []
-        for kind in file_makers.KINDS:
+        for kind in file_formats.KINDS:
             if kind.name not in SOURCES:
                 continue
             place = Path(root) / f"{len(sources)} {kind.name}".replace("/", " ")

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 import jaxvr
-from experiments import file_makers
+from experiments import file_formats, file_makers
 from experiments.data import folder
 
 TOLERANCE = 1e-6
@@ -106,7 +106,7 @@ def compare(mesh: jaxvr.TetMesh, truth: Any, tolerance: float = TOLERANCE) -> st
 
 
 def rows(folder: Path, only: str = "") -> Iterator[dict[str, str]]:
-    for kind in file_makers.KINDS:
+    for kind in file_formats.KINDS:
         if only and only not in kind.name:
             continue
         place = folder / kind.name.replace("/", "_").replace(" ", "_")

@@ -499,52 +499,6 @@ def _series(place: Path) -> Made:
     return Made(place / "a.vtu.series", grids[2])
 
 
-@kind("Exodus, blocks, steps, TETRA4", "netCDF4, by hand")
-def _exodus_blocks(place: Path) -> Made:
-    path = place / "a.e"
-    left, right = _exodus_file(path)
-    return Made(path, right, "dens", {"block": "2", "step": 1})
-
-
-def _exodus_file(path: Path) -> tuple[Any, Any]:
-    netCDF4: Any = importlib.import_module("netCDF4")
-    grid = tetrahedra(1)
-    cells = grid.cell_connectivity.reshape(-1, 4)
-    halves_ = [cells[:2], cells[2:]]
-    with netCDF4.Dataset(str(path), "w", format="NETCDF3_64BIT_OFFSET") as d:
-        d.setncatts({"api_version": np.float32(5), "version": np.float32(5),
-                     "floating_point_word_size": np.int32(8), "file_size": np.int32(1),
-                     "title": "a"})  # fmt: skip
-        for name, n in (("len_string", 33), ("len_line", 81), ("four", 4), ("time_step", None),
-                        ("num_dim", 3), ("num_nodes", grid.n_points), ("num_elem", len(cells)),
-                        ("num_el_blk", 2), ("num_nod_var", 1), ("num_elem_var", 1)):  # fmt: skip
-            d.createDimension(name, n)
-        d.createVariable("time_whole", "f8", ("time_step",))[:] = [0.0, 1.0, 2.0]
-        d.createVariable("eb_status", "i4", ("num_el_blk",))[:] = 1
-        ids = d.createVariable("eb_prop1", "i4", ("num_el_blk",))
-        ids.setncattr("name", "ID")
-        ids[:] = [1, 2]
-        for a, x in zip("xyz", grid.points.T, strict=True):
-            d.createVariable(f"coord{a}", "f8", ("num_nodes",))[:] = x
-        for k, rows in enumerate(halves_, 1):
-            d.createDimension(f"num_el_in_blk{k}", len(rows))
-            d.createDimension(f"num_nod_per_el{k}", 4)
-            v = d.createVariable(f"connect{k}", "i4", (f"num_el_in_blk{k}", f"num_nod_per_el{k}"))
-            v.setncattr("elem_type", "TETRA4")
-            v[:] = rows + 1
-        for what, name in (("nod", "temp"), ("elem", "dens")):
-            v = d.createVariable(f"name_{what}_var", "S1", (f"num_{what}_var", "len_string"))
-            v[0, : len(name)] = [*name]
-        d.createVariable("elem_var_tab", "i4", ("num_el_blk", "num_elem_var"))[:] = [[0], [1]]
-        v = d.createVariable("vals_nod_var1", "f8", ("time_step", "num_nodes"))
-        v[:] = [grid.point_data["t"] + k for k in range(3)]
-        v = d.createVariable("vals_elem_var1eb2", "f8", ("time_step", "num_el_in_blk2"))
-        v[:] = [np.arange(len(halves_[1])) + 10.0 * k for k in range(3)]
-    made = [unstructured([(10, rows)], grid.points) for rows in halves_]
-    made[1].cell_data["dens"] = np.arange(len(halves_[1])) + 10.0
-    return made[0], made[1]
-
-
 @kind("EnSight Gold, ascii", "by hand")
 def _ensight(place: Path) -> Made:
     grid = hexahedra()

@@ -120,6 +120,9 @@ class PlotterComponent:
 
     The scene is the plotter's camera and window, and the one volume that its active renderer
     shows: the data, colours, opacities, unit distance and matrix of what `add_volume` added.
+    Points of image data whose volume property interpolates by the nearest (`add_volume` leaves it
+    so) become cells round them; with `volume.prop.interpolation_type = "linear"` values are linear
+    between points. Unstructured grids are linear with either, as VTK draws them.
     """
 
     def __init__(self, plotter: Any):
@@ -219,13 +222,48 @@ def _data(volume: Any) -> TetMesh:
     mode = mapper.GetScalarMode()
     location = {1: "point", 2: "cell", 3: "point", 4: "cell"}.get(mode)
     field = mapper.GetArrayName() or None if mode in (3, 4) else None
-    mesh = TetMesh.from_pyvista(data, field, location=location)
+    nearest = volume.GetProperty().GetInterpolationType() == 0
+    dual = _dual(data, field, location) if nearest else None
+    if dual is None:
+        mesh = TetMesh.from_pyvista(data, field, location=location)
+    else:
+        mesh = TetMesh.from_pyvista(dual, location="cell")
     matrix = volume.GetMatrix()
     if not matrix.IsIdentity():
         m = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
         points = mesh.absolute_points() @ m[:3, :3].T + m[:3, 3]
         mesh = dataclasses.replace(mesh, origin=NOWHERE).replace(points=points)
     return mesh
+
+
+def _dual(data: Any, field: str | None, location: str | None) -> Any:
+    """A grid with a cell round each point of image data or of a rectilinear grid, up to the middle
+    between points: what the nearest point's value looks like. None for other data, which VTK always
+    interpolates, and for cell data."""
+    import pyvista
+
+    array = data.GetPointData().GetArray(field) if field else data.GetPointData().GetScalars()
+    if location == "cell" or array is None or not array.GetName():
+        return None
+    if data.IsA("vtkImageData"):
+        low = data.GetExtent()[::2]
+        axes = [np.arange(n) + float(first) for n, first in zip(data.GetDimensions(), low)]
+        m = data.GetIndexToPhysicalMatrix()
+        matrix = np.array([[m.GetElement(i, j) for j in range(4)] for i in range(4)])
+    elif data.IsA("vtkRectilinearGrid"):
+        coordinates = data.GetXCoordinates(), data.GetYCoordinates(), data.GetZCoordinates()
+        axes = [np.asarray(pyvista.convert_array(c), np.float64) for c in coordinates]
+        matrix = np.eye(4)
+    else:
+        return None
+    if min(map(len, axes)) < 2 or data.HasAnyBlankPoints() or data.HasAnyBlankCells():
+        return None
+    edges = [np.concatenate([x[:1], (x[1:] + x[:-1]) / 2, x[-1:]]) for x in axes]
+    grid = pyvista.RectilinearGrid(*edges).cast_to_structured_grid()
+    grid.points = np.asarray(grid.points) @ matrix[:3, :3].T + matrix[:3, 3]
+    grid.cell_data[array.GetName()] = np.asarray(pyvista.convert_array(array))
+    grid.set_active_scalars(array.GetName(), preference="cell")
+    return grid
 
 
 def _look(volume: Any) -> TransferFunction:

@@ -65,10 +65,11 @@ def look(
     """
     floats = (volume.values, volume.points, camera.eye, camera.target)
     floats = (*floats, transfer.positions, transfer.extinctions)
-    others = (camera.up, camera.fov, camera.extent, transfer.colors)
+    others = (camera.up, camera.fov, camera.extent, transfer.colors, volume.cells)
     if not is_concrete(seen, *floats, *others):
         return
-    glance = np.asarray(_glance(camera.extent is not None, seen, *floats))
+    corners = volume.cells if volume.location == "point" else None
+    glance = np.asarray(_glance(camera.extent is not None, seen, corners, *floats))
     alpha, low, high, first, last, top, diagonal, cut = (float(x) for x in glance)
     low, high, first, last = (x + volume.offset for x in (low, high, first, last))
     odd = _odd((low, high), (first, last))
@@ -139,10 +140,17 @@ def _odd(field: tuple[float, float], ends: tuple[float, float]) -> bool:
 
 
 @partial(jax.jit, static_argnums=0)
-def _glance(parallel, seen, values, points, eye, target, positions, extinctions):
+def _glance(parallel, seen, corners, values, points, eye, target, positions, extinctions):
     """The largest alpha, the ends of the values, the ends of the positions, the largest extinction,
     the diagonal of the box of the points, and whether the eye lies in it (or the plane of parallel
-    rays cuts it)."""
+    rays cuts it).
+
+    corners: the cells (N, 4) that values of points belong to: that of a point without a cell would
+    widen the range, which then looks like the transfer function's. The box is of all points: a
+    larger one makes more look odd, and that is looked at again.
+    """
+    if corners is not None:
+        values = values.at[corners].get(mode="promise_in_bounds")
     # Eight points a row, which XLA reduces three times as fast as one.
     rows = jnp.pad(points, ((0, -len(points) % 8), (0, 0)), mode="edge").reshape(-1, 24)
     low = rows.min(axis=0).reshape(8, 3).min(axis=0)

@@ -69,7 +69,7 @@ def test_a_plotter_is_drawn_with_its_own_camera_colours_and_opacities(kind):
     plotter.camera.position, plotter.camera.focal_point = (4.0, 3.0, 2.0), (0.6, 0.4, 1.5)
     plotter.camera.view_angle, plotter.camera.up = 40.0, (0, 0, 1)
     mesh, camera, transfer = plotter.jaxvr.scene()
-    assert mesh.report.field == "t" and mesh.location == "point"
+    assert mesh.report.field == "t" and mesh.location == ("cell" if kind == "image" else "point")
     assert (camera.width, camera.height, float(camera.fov)) == (16, 12, 40)
     np.testing.assert_allclose(camera.eye, (4, 3, 2))
     low, high = 300 - 4.5, 301.5
@@ -94,6 +94,75 @@ def test_the_array_that_the_mapper_takes():
     volume.mapper.SelectScalarArray("c")
     mesh = plotter.jaxvr.scene()[0]
     assert (mesh.report.field, mesh.location) == ("c", "cell")
+
+
+def turned() -> Any:
+    grid = lattice()
+    grid.origin, grid.extent = (1.0, -2.0, 0.5), (2, 5, -1, 2, 0, 3)
+    c, s = np.cos(0.5), np.sin(0.5)
+    grid.direction_matrix = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+    grid.point_data["t"] = 300.0 + np.arange(grid.n_points) % 7
+    return grid
+
+
+def rectilinear() -> Any:
+    grid = pyvista.RectilinearGrid([0.0, 1.0, 1.5], [0.0, 0.1, 2.0, 2.5], [-1.0, 0.0])
+    grid.point_data["t"] = np.arange(grid.n_points) ** 2 % 11
+    return grid
+
+
+@pytest.mark.parametrize("make", [lattice, turned, rectilinear])
+def test_interpolation_by_the_nearest_is_the_value_of_the_nearest_point(make):
+    """As VTK draws image data unless told otherwise; compared with a search for that point."""
+    grid = make()
+    plotter, (volume,) = plotter_of(grid, scalars="t")
+    mesh = plotter.jaxvr.scene()[0]
+    assert mesh.location == "cell" and mesh.report.field == "t"
+    middle = np.asarray(mesh.points, np.float64)[np.asarray(mesh.cells)].mean(axis=1)
+    shown = volume.mapper.GetInput()
+    near = [shown.FindPoint(p) for p in middle]
+    np.testing.assert_allclose(mesh.values, np.asarray(shown.point_data["t"])[near], rtol=1e-6)
+    low, high = np.reshape(shown.bounds, (3, 2)).T
+    np.testing.assert_allclose(mesh.bounds()[0], low, atol=1e-5)
+    np.testing.assert_allclose(mesh.bounds()[1], high, atol=1e-5)
+    volume.prop.interpolation_type = "linear"
+    assert plotter.jaxvr.scene()[0].location == "point"
+    volume.prop.interpolation_type = "nearest"
+
+
+def inside_hull(points: Any, pixels: Any) -> Any:
+    """Which pixels (n, 2) lie in the convex hull of points (P, 2), and how far from its edge."""
+    from scipy.spatial import ConvexHull
+
+    a = ConvexHull(points).equations
+    return (pixels @ a[:, :2].T + a[:, 2]).max(axis=1)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("kind", ["image", "unstructured"])
+def test_a_screenshot_covers_the_pixels_that_vtk_projects_the_grid_to(kind, parallel):
+    """The silhouette of a box, by VTK's own matrix, to a hundredth of a pixel."""
+    grid = lattice() if kind == "image" else lattice().cast_to_unstructured_grid()
+    plotter, (volume,) = plotter_of(grid, opacity=1.0)
+    plotter.window_size = [40, 24]
+    plotter.camera.position, plotter.camera.focal_point = (4.0, 3.0, 2.0), (0.3, 0.6, 1.2)
+    plotter.camera.up, plotter.camera.roll = (0, 0, 1), 23.7
+    plotter.camera.parallel_projection, plotter.camera.parallel_scale = parallel, 2.13
+    matrix = np.diag([1.0, 2, 1, 1])
+    matrix[:3, 3] = 0.1, -0.2, 0.3
+    volume.user_matrix = matrix
+    shot = plotter.jaxvr.screenshot(transparent_background=True)
+    seen = plotter.jaxvr.render()[..., 3] > 0
+    m = plotter.camera.GetCompositeProjectionTransformMatrix(40 / 24, -1, 1)
+    m = np.array([[m.GetElement(i, j) for j in range(4)] for i in range(4)]) @ matrix
+    corners = np.concatenate([np.asarray(grid.points), np.ones((grid.n_points, 1))], 1) @ m.T
+    display = (corners[:, :2] / corners[:, 3:] + 1) / 2 * (40, 24)
+    y, x = np.mgrid[:24, :40]
+    depth = inside_hull(display, np.stack([x.ravel() + 0.5, 23.5 - y.ravel()], 1)).reshape(24, 40)
+    clear = np.abs(depth) > 0.01
+    np.testing.assert_array_equal(seen[clear], (depth < 0)[clear])
+    assert 150 < seen.sum() < 850 and (~clear).sum() < 5
+    assert (shot[..., 3] > 0)[depth < -1].all() and not (shot[..., 3] > 0)[depth > 0.01].any()
 
 
 def test_a_screenshot_has_the_background_and_goes_to_a_file(tmp_path):
@@ -134,9 +203,9 @@ def test_what_jaxvr_does_not_draw_is_told():
     with pytest.raises(ValueError, match="shows 2 volumes"):
         plotter.jaxvr.scene()
     with pytest.warns(UserWarning, match=r"1 other volume\(s\) of the plotter left out"):
-        assert plotter.jaxvr.scene(volumes[1])[0].n_points == 27
+        assert plotter.jaxvr.scene(volumes[1])[0].n_points == 64
     volumes[0].SetVisibility(False)
-    assert plotter.jaxvr.scene()[0].n_points == 27
+    assert plotter.jaxvr.scene()[0].n_points == 64
     plotter.add_mesh(pyvista.Sphere())
     with pytest.warns(UserWarning, match=r"1 surface\(s\) of the plotter left out"):
         plotter.jaxvr.scene()

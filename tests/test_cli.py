@@ -57,6 +57,92 @@ def test_info_plot3d_solution(file_of, capsys):
     assert "pressure" in out and f"{want.min():.4g}" in out and f"{want.max():.4g}" in out, out
 
 
+STEPS_AND_BLOCKS = """$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$PhysicalNames
+2
+3 7 "lower part"
+3 8 "upper part"
+$EndPhysicalNames
+$Nodes
+5
+1 0 0 0
+2 1 0 0
+3 0 1 0
+4 0 0 1
+5 0 0 -3
+$EndNodes
+$Elements
+2
+1 4 2 8 1 1 2 3 4
+2 4 2 7 1 1 3 2 5
+$EndElements
+"""
+
+
+@pytest.fixture(scope="module")
+def steps(tmp_path_factory):
+    """A gmsh file with two blocks, and steps k at 0, 0.5 and 1, of values 100 k to 100 k + 4."""
+    path = tmp_path_factory.mktemp("steps") / "a.msh"
+    text = STEPS_AND_BLOCKS
+    for k in range(3):
+        rows = "".join(f"{n + 1} {100 * k + n}\n" for n in range(5))
+        text += f'$NodeData\n1\n"temp"\n1\n{k / 2}\n3\n{k}\n1\n5\n{rows}$EndNodeData\n'
+    path.write_text(text)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("given", "field", "tets"),
+    [
+        (["--step", "0"], "0 to 4", 2),
+        (["--step", "1"], "100 to 104", 2),
+        (["--step=-1"], "200 to 204", 2),
+        (["--step", "0.5"], "100 to 104", 2),
+        (["--step", "1.0"], "200 to 204", 2),
+        (["--step", "0", "--block", "upper part"], "0 to 3", 1),
+        (["--step", "5e-1", "--block", "lower part"], "100 to 104", 1),
+    ],
+)
+def test_steps_and_blocks(given, field, tets, steps, tmp_path, capsys):
+    assert main(["info", steps, *given]) == 0
+    said = capsys.readouterr()
+    assert f"point data, {field}\n" in said.out and said.err == ""
+    assert f"{tets} tetrahedr" in said.out
+    assert "temp (point, 3 steps, blocks lower part, upper part)" in said.out
+    out = tmp_path / "a.npy"
+    assert main(["render", steps, "-o", str(out), "--width", "2", "--height", "2", *given]) == 0
+    assert f"field temp, {field}, colours from" in capsys.readouterr().out
+
+
+def test_the_step_that_was_taken_is_told(steps, capsys):
+    assert main(["info", steps]) == 0
+    said = capsys.readouterr()
+    assert "point data, 200 to 204\n" in said.out
+    (line,) = said.err.strip().splitlines()
+    assert line.startswith(
+        "jaxvr: warning: a.msh: It has 3 time steps, at 0 to 1, of which the last"
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["--step", "3"], "There is no step 3: it has 3, at times 0, 0.5, 1"),
+        (["--step", "0.25"], "There is no step at time 0.25"),
+        (["--step", "last"], "--step must be an index (3) or a time with a point (0.5)"),
+        (["--step", "nan"], "There is no step at time nan"),
+        (["--step", "0", "--block", "middle"], "There is no block 'middle'. It has 'lower part', "),
+    ],
+)
+def test_steps_and_blocks_that_are_not_there(given, message, steps, capsys):
+    assert main(["render", steps, "-o", "a.npy", *given]) == 2
+    said = capsys.readouterr()
+    (line,) = said.err.strip().splitlines()
+    assert line.startswith("jaxvr: error: ") and message in line and said.out == ""
+
+
 def test_render_png_is_transparent_and_npy_is_exact(mesh, tf, tmp_path, capsys):
     for name in ("a.png", "a.npy"):
         assert main(["render", mesh, "--tf", tf, "-o", str(tmp_path / name), *SMALL]) == 0

@@ -96,6 +96,32 @@ def test_points_that_no_cell_uses_count_in_no_statistic():
     assert views[0]["range"] == views[1]["range"] and views[0]["counts"] == views[1]["counts"]
 
 
+@pytest.mark.parametrize(("fill", "far"), [(1e3, 0), (1e9, 0), (1e20, 3), (9.96921e36, 3)])
+def test_fill_values_of_points_that_no_cell_uses(fill, far):
+    """Of coordinates and of the field: the picture is that of the mesh without them."""
+    mesh = lattice(lambda p: p[..., 0], (2, 2, 2))
+    mesh = jaxvr.TetMesh.from_pyvista(mesh.to_pyvista(), dtype="float32")
+    points = np.concatenate([np.full((3, 3), fill), np.asarray(mesh.points)])
+    values = np.concatenate([np.full(3, fill), np.asarray(mesh.values)])
+    cells = {"tetra": np.asarray(mesh.cells) + 3}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        other = jaxvr.TetMesh.from_cells(points, cells, values, dtype="float32")
+    told = [w for w in caught if "that no cell uses" in str(w.message)]
+    assert len(told) == (far > 0)
+    if far:
+        assert f"3 points that no cell uses, out to {fill:.3g}" in str(told[0].message)
+        assert told[0].filename == __file__
+    transfer = jaxvr.default_transfer(other)
+    if fill == 1e20:  # where pictures were wrong without a word
+        camera = jaxvr.Camera.orbit(other, width=8, height=8)
+        want = jaxvr.render(mesh, camera, transfer)
+        np.testing.assert_array_equal(jaxvr.render(other, camera, transfer), want)
+    np.testing.assert_array_equal(other.points[3:], mesh.points)
+    np.testing.assert_allclose(other.points[:3], 0.5 if far else fill)
+    np.testing.assert_array_equal(transfer.positions, jaxvr.default_transfer(mesh).positions)
+
+
 def test_the_axis_that_shows_most():
     """By pictures that are rendered; the rough ones choose one that shows 0.89 of the best here."""
     for thin, field in ((0, 1), (1, 2), (2, 0)):

@@ -11,6 +11,7 @@ import re
 import shlex
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import meshio
@@ -59,6 +60,47 @@ def test_code_blocks_run_as_printed(page, tmp_path, monkeypatch, quick_jit):
         for key, value in kept.items():
             update(key, value)
         update("jax_enable_x64", True)
+
+
+def test_layers_of_the_page_on_xarray():
+    """Its functions on faces with 3 to 6 corners: volumes of columns, and what stands for none."""
+    names: dict[str, Any] = {"np": np}
+    for code in blocks(ROOT / "notebooks" / "from_xarray.md", "python"):
+        if "\ndef " in f"\n{code}":
+            exec(code, names)
+    angles = [2 * np.pi * np.arange(n) / n for n in (3, 4, 5, 6)]
+    x = np.concatenate([3 * k + np.cos(a) for k, a in enumerate(angles)])
+    y = np.concatenate([np.sin(a) for a in angles])
+    faces = np.full((4, 6), -1)
+    for k, first in enumerate((0, 3, 7, 12)):
+        faces[k, : k + 3] = first + np.arange(k + 3)
+    height = np.array([0.0, 0.5, 2.0])[:, None] + 0.1 * x
+    points, cells, which = names["columns"](x, y, faces, height)
+    of_face = {kind: np.broadcast_to(at, c.shape[:2]).ravel() for (kind, at), c in zip(
+        which.items(), (cells[k] for k in which), strict=True)}  # fmt: skip
+    flat = {kind: c.reshape(-1, c.shape[-1]) for kind, c in cells.items()}
+    mesh = jaxvr.TetMesh.from_cells(points, flat, of_face, location="cell", dtype="float64")
+    corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
+    volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6
+    found = np.bincount(np.asarray(mesh.values).astype(int), volumes)
+    want = [2 * n * np.sin(2 * np.pi / n) / 2 for n in (3, 4, 5, 6)]
+    np.testing.assert_allclose(found, want, rtol=1e-12)
+
+    def variable(values, **about):
+        return SimpleNamespace(values=np.asarray(values), attrs=about)
+
+    ones = np.where(faces < 0, -999, faces + 1)
+    nan = np.where(faces < 0, np.nan, faces + 1)
+    least, most = (np.where(faces < 0, end, faces) for end in (-(2**63), 2**31 - 1))
+    for given in (
+        variable(ones, start_index=1, _FillValue=-999),
+        variable(nan, start_index=1),
+        variable(np.where(faces < 0, 0, faces + 1), start_index=1, _FillValue=0),
+        variable(least, _FillValue=-(2**63)),
+        variable(most, _FillValue=2**31 - 1),
+        variable(faces),
+    ):
+        np.testing.assert_array_equal(names["faces_of"](given), faces)
 
 
 def test_commands_of_the_readme_run_as_printed(tmp_path, monkeypatch, capsys, quick_jit):

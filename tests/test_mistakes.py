@@ -210,6 +210,26 @@ def test_transfer_function_outside_of_the_field(mesh, camera):
     assert "no extinction where the field lies" in told(cellwise, camera, between)
 
 
+@pytest.mark.parametrize("flat", [False, True])
+def test_points_that_no_cell_uses_hide_no_mistake(mesh, camera, flat):
+    """Neither the range that one of them has, nor its place."""
+    far = 1e4 if flat else 0.5
+    points = np.concatenate([np.asarray(mesh.points), [[far] * 3]])
+    values = np.concatenate([np.asarray(mesh.values), [1e3]])
+    tets = {"tetra": np.asarray(mesh.cells)}
+    with pytest.warns(UserWarning, match="inverted"):
+        other = jaxvr.TetMesh.from_cells(points, tets, values, dtype="float32")
+    if flat:
+        camera = camera.replace(extent=2.0)
+    units = ramp(0, 1000)  # the field takes a thousandth of it
+    message = told(other, camera, units)
+    assert message == told(mesh, camera, units) and "the field takes 0.1 %" in message
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        same = jaxvr.render(other, camera, ramp())
+    np.testing.assert_allclose(same, jaxvr.render(mesh, camera, ramp()), atol=1e-6)
+
+
 def test_points_that_lose_digits_in_float32():
     z, y, x = np.meshgrid(*[np.linspace(0, 1, 5)] * 3, indexing="ij")
     points, cells = np.stack([x.ravel(), y.ravel(), z.ravel()], 1), grid_cells(5, 5, 5)

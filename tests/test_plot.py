@@ -33,7 +33,7 @@ def picture(height=6, width=9):
 JUMP = TransferFunction.from_colormap("viridis", [0.0, 0.4, 0.4, 1.0], [0.0, 2.0, 0.5, 1.0])
 NOTHING = TransferFunction([0.5], [[1.0, 0.0, 0.0]], [0.0])
 SLOPE = TransferFunction.tree_unflatten(
-    None, (np.zeros(4), np.linspace(-1, 2, 12).reshape(4, 3), np.array([1.0, -3.0, 0.0, 2.0]))
+    0.0, (np.zeros(4), np.linspace(-1, 2, 12).reshape(4, 3), np.array([1.0, -3.0, 0.0, 2.0]))
 )
 KMAP = jaxvr.KMap(
     entries=np.array([[1, 1, 2, 3], [6, 7, 90, 1]]),

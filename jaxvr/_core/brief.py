@@ -33,10 +33,9 @@ def brief(x: Any) -> str:
     return f"{dtype}[{', '.join(map(str, shape))}]"
 
 
-def spanned(low: Any, high: Any) -> str:
-    """Two numbers as "low to high", with as many digits as tell them apart, six at least."""
+def spanned(low: Any, high: Any, digits: int = 6) -> str:
+    """Two numbers as "low to high", with as many digits as tell them apart, so many at least."""
     low, high = float(low), float(high)
-    digits = 6
     while digits < 17 and low != high and _part(low, high, digits) > 1e-3:
         digits += 1
     return f"{low:.{digits}g} to {high:.{digits}g}"

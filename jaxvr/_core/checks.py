@@ -120,9 +120,10 @@ def require_finite(name: str, x: Any) -> None:
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
         where = first[0] if len(first) == 1 else first
+        more = ": there is no colour for NaN, as ParaView has one" if name == "values" else ""
         raise ValueError(
             f"{name} has {int(bad.sum())} NaN or infinite entries, the first at index {where}. "
-            "Remove or replace them."
+            f"Remove or replace them{more}."
         )
 
 

@@ -110,7 +110,7 @@ function picture(setup, requests) {
   const zoom = (factor) => requests.add((p) => (p.zoom = (p.zoom ?? 1) * factor));
   const again = () =>
     requests.add((p) => {
-      delete p.turn, delete p.shift, delete p.zoom;
+      for (const move of ["up", "angles", "turn", "shift", "zoom"]) delete p[move];
       p.reset = [...(p.reset ?? []), "view"];
     });
 
@@ -170,6 +170,51 @@ function picture(setup, requests) {
     bitmap.close();
   }
   return { canvas, show };
+}
+
+// Buttons for the axis that is up and for views by name.
+function buttons(setup, requests) {
+  const make = (text, title, press) => {
+    const it = node("button", { type: "button", title, "aria-pressed": "false" }, text);
+    it.addEventListener("click", press);
+    return it;
+  };
+  const ups = setup.ups.map((name) => {
+    const press = () => requests.add((p) => (p.up = name));
+    return make(name.replace("-", "−"), `Turn ${name} up`, press);
+  });
+  const views = Object.entries(setup.views).map(([name, angles]) => {
+    const title = `Look from azimuth ${angles[0]}°, elevation ${angles[1]}°`;
+    const press = () =>
+      requests.add((p) => {
+        delete p.turn; // of before
+        p.angles = angles;
+      });
+    return make(name, title, press);
+  });
+  const row = node(
+    "div",
+    { class: "row buttons" },
+    node("span", { role: "group", "aria-label": "Axis that is up" }, "up ", ...ups),
+    node("span", { role: "group", "aria-label": "Views" }, "view ", ...views),
+  );
+  const press = (it, on) => it.setAttribute("aria-pressed", String(on));
+  function adopt(state) {
+    setup.ups.forEach((name, k) => press(ups[k], state.up === name));
+    Object.values(setup.views).forEach(([azimuth, elevation], k) => {
+      const turned = Math.abs(((state.azimuth - azimuth + 540) % 360) - 180);
+      press(views[k], turned < 1e-6 && Math.abs(state.elevation - elevation) < 1e-6);
+    });
+  }
+  return { row, adopt };
+}
+
+// Where the picture is seen from, in words.
+function stands(state) {
+  const [a, e] = [state.azimuth, state.elevation].map((x) => x.toFixed(1));
+  const up = `${state.up} up${state.chosen ? ", which shows most" : ""}`;
+  const from = state.from ? `  from ${state.from}` : "";
+  return `${up}  azimuth ${a}°  elevation ${e}°${from}  zoom ${state.zoom.toFixed(2)}`;
 }
 
 function editor(setup, requests) {
@@ -388,7 +433,9 @@ function render({ model, el }) {
   };
   const queue = requests(model, say);
   const { canvas, show } = picture(setup, queue);
+  const turns = buttons(setup, queue);
   const { svg, row, adopt } = editor(setup, queue);
+  const told = node("div", { class: "told" });
   const help =
     "Picture: drag to rotate, scroll to zoom, shift-drag to move, double-click to start again. " +
     "Curve: drag points, double-click to add one, right-click or Delete to remove one.";
@@ -397,16 +444,20 @@ function render({ model, el }) {
     { class: "jaxvr-explorer", "data-lm-suppress-shortcuts": "true" },
     canvas,
     node("div", { class: "row" }, view, quality),
+    turns.row,
     svg,
     row,
+    told,
     node("div", { class: "help" }, help),
   );
   root.style.width = `${Math.max(setup.width, 320)}px`;
   el.append(root);
 
   function receive(message, buffers) {
+    const tell = (state) => (told.textContent = state.told);
     if (message.kind === "changed") {
       adopt(message.state);
+      tell(message.state);
       queue.add(() => {});
       return;
     }
@@ -414,8 +465,9 @@ function render({ model, el }) {
     const current = queue.answered(message);
     const state = message.state;
     if (state) {
-      const [a, e] = [state.azimuth, state.elevation].map((x) => x.toFixed(1));
-      view.textContent = `azimuth ${a}°  elevation ${e}°  zoom ${state.zoom.toFixed(2)}`;
+      view.textContent = stands(state);
+      turns.adopt(state);
+      tell(state);
       if (current) adopt(state);
     }
     if (message.error) return say(message.error, "error");

@@ -28,15 +28,19 @@ def explore(
     """A widget that shows a volume, for Jupyter and whatever else shows anywidgets.
 
     Drag to rotate, scroll to zoom, drag with shift or the right button to shift the picture, double
-    click to start again; arrow keys, + and - do the same. Below is the transfer function over a
+    click to start again; arrow keys, + and - do the same. Buttons turn another axis up, and look
+    from the front (azimuth 0), the right (90), the back, the left, the top and the bottom; a line
+    says which axis is up, and from where the view is. Below is the transfer function over a
     histogram of the values: drag its points, double click to add one, right click or Delete to
     remove one. Pictures are coarse while something moves and exact, as `jaxvr.render` gives them,
     as soon as it rests.
 
     Args:
       volume: a `TetMesh`.
-      transfer: to start with; None takes `jaxvr.default_transfer` with six points.
-      camera: to start with, and its pixels; None takes `Camera.orbit(volume)`.
+      transfer: to start with; None takes `jaxvr.default_transfer` with six points, which spans the
+        field's 1 to 99 % quantiles by volume. The widget says what it spans.
+      camera: to start with, and its pixels; None takes `Camera.orbit(volume, up=)` with that of the
+        axes y, z and x up which shows most. The widget says which.
       size: pixels of both sides, where no camera is given.
       coarse: pixels of the longer side while something moves; None takes as many as can be drawn
         in 60 ms.

@@ -11,9 +11,14 @@ import numpy as np
 from jaxvr._core.units import norm
 from jaxvr.view.camera import Camera, orbit_axes
 
-# Straight up or down a picture has no upper side.
+# A hand stops before straight up or down, where a turn of the azimuth turns the picture.
 STEEPEST = 89.0
 ZOOMS = (0.05, 100.0)
+AXES = {
+    f"{sign}{n}": np.eye(3)[k] * float(f"{sign}1")
+    for sign in ("", "-")
+    for k, n in enumerate("xyz")
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,11 +66,36 @@ class Orbit:
 
     def turned(self, azimuth: float, elevation: float) -> Orbit:
         """By degrees; the elevation stays below 90, the azimuth in [-180, 180)."""
+        if elevation:
+            elevation = _between(self.elevation + elevation, -STEEPEST, STEEPEST)
+        else:
+            elevation = self.elevation  # from straight above a picture may be turned
+        return self.seen_from(self.azimuth + azimuth, elevation)
+
+    def seen_from(self, azimuth: float, elevation: float) -> Orbit:
+        """From these angles in degrees, 90 for straight above."""
+        azimuth, elevation = float(azimuth), float(elevation)
+        if not (math.isfinite(azimuth) and math.isfinite(elevation)):
+            raise ValueError(f"Angles must be degrees, but are {azimuth} and {elevation}.")
         return dataclasses.replace(
-            self,
-            azimuth=(self.azimuth + azimuth + 180) % 360 - 180,
-            elevation=_between(self.elevation + elevation, -STEEPEST, STEEPEST),
+            self, azimuth=(azimuth + 180) % 360 - 180, elevation=_between(elevation, -90, 90)
         )
+
+    def upright(self, name: str) -> Orbit:
+        """With another axis up, "z" or "-y", from the same angles about that one."""
+        if name not in AXES:
+            raise ValueError(f"up must be one of {', '.join(AXES)}, but is {name!r}.")
+        return dataclasses.replace(self, axes=orbit_axes(AXES[name]))
+
+    @property
+    def up(self) -> str:
+        """The axis that is up, such as "z" or "-y", or three numbers for another direction."""
+        return _axis(self.axes[1]) or "(" + ", ".join(f"{x:.3g}" for x in self.axes[1]) + ")"
+
+    @property
+    def from_axis(self) -> str:
+        """The axis that the view looks from, such as "x" or "-z"; "" for another direction."""
+        return _axis(self._basis()[2])
 
     def zoomed(self, factor: float) -> Orbit:
         """Closer by a factor above 0."""
@@ -84,8 +114,10 @@ class Orbit:
 
     def camera(self, width: int, height: int, dtype: Any = None) -> Camera:
         """The view with that many pixels."""
-        eye = self.target + self._away() * self._basis()[2]
-        up = self.axes[1]
+        _, true_up, out = self._basis()
+        eye = self.target + self._away() * out
+        # Straight above, the axis that is up shows no upper side of the picture.
+        up = self.axes[1] if abs(self.elevation) <= STEEPEST else true_up
         if self.fov is not None:
             return Camera.look_at(eye, self.target, up, self.fov, width, height, dtype=dtype)
         extent = 2 * self.radius / self.zoom
@@ -104,6 +136,11 @@ class Orbit:
         out = math.cos(e) * (math.sin(a) * x + math.cos(a) * z) + math.sin(e) * y
         side = math.cos(a) * x - math.sin(a) * z
         return side, np.cross(out, side), out
+
+
+def _axis(direction: np.ndarray) -> str:
+    """The axis of the world that a unit vector is, but for rounding, or ""."""
+    return next((n for n, axis in AXES.items() if np.abs(direction - axis).max() < 1e-6), "")
 
 
 def _between(x: float, low: float, high: float) -> float:

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxvr._core import svg
-from jaxvr._core.brief import is_known
+from jaxvr._core.brief import is_known, spanned
 from jaxvr._core.checks import require_kind
 from jaxvr._core.status import check
 from jaxvr.arguments import background_of
-from jaxvr.defaults import UPS, best_up, default_transfer, diagonal
+from jaxvr.defaults import QUANTILES, UPS, best_up, default_transfer, diagonal
 from jaxvr.interact import edits as _edits
-from jaxvr.interact.orbit import Orbit
+from jaxvr.interact.orbit import AXES, Orbit
 from jaxvr.interact.pace import Pace
 from jaxvr.interact.png import encode
 from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
@@ -35,6 +35,15 @@ from jaxvr.volume.statistics import used_values, value_range
 SEGMENT_BYTES = 1 << 30
 # Control points of a default transfer function: few enough to be moved by hand.
 POINTS = 6
+# Views by name: azimuth and elevation.
+VIEWS = {
+    "front": (0, 0),
+    "right": (90, 0),
+    "back": (180, 0),
+    "left": (-90, 0),
+    "top": (0, 90),
+    "bottom": (0, -90),
+}
 
 
 class Frame(NamedTuple):
@@ -72,12 +81,15 @@ class Viewer:
         self.volume, self.tracer, self.integrator = volume, tracer, integrator
         self.background = background_of(background)
         self.range = value_range(volume)
-        self._transfer = self._first_transfer = _transfer_of(
-            transfer or default_transfer(volume, points=POINTS)
-        )
+        self._told = ""
+        if transfer is None:
+            transfer = default_transfer(volume, points=POINTS)
+            self._told = _spans(transfer, *self.range)
+        self._transfer = self._first_transfer = _transfer_of(transfer)
+        # The axis that was chosen here, "" where the camera was given.
+        self.chosen_up = "" if camera is not None else best_up(volume, self._transfer)
         if camera is None:
-            up = UPS[best_up(volume, self._transfer)]
-            camera = Camera.orbit(volume, up=up, width=size, height=size)
+            camera = Camera.orbit(volume, up=UPS[self.chosen_up], width=size, height=size)
         self.orbit = self._first_orbit = Orbit.of(camera, diagonal(volume) / 2)
         self.width, self.height = camera.width, camera.height
         # Shading is faster than rendering, so it may have more pixels.
@@ -120,9 +132,9 @@ class Viewer:
     def apply(self, message: Mapping[str, Any]) -> None:
         """What a hand did since the last message, each part optional.
 
-        turn: degrees [azimuth, elevation]. shift: parts of the picture's height [right, up]. zoom:
-        a factor. edits: a list for `edits.apply`. reset: a list of "view" and "transfer", which
-        happens first.
+        reset: a list of "view" and "transfer", which happens first. up: the name of the axis to
+        turn up. angles: degrees [azimuth, elevation] to look from. turn: by how many more. shift:
+        parts of the picture's height [right, up]. zoom: a factor. edits: a list for `edits.apply`.
         """
         for what in message.get("reset") or ():
             if what == "view":
@@ -130,6 +142,10 @@ class Viewer:
             elif what == "transfer":
                 self.transfer = self._first_transfer
         orbit = self.orbit
+        if message.get("up") is not None:
+            orbit = orbit.upright(message["up"])
+        if message.get("angles") is not None:
+            orbit = orbit.seen_from(*message["angles"])
         azimuth, elevation = message.get("turn") or (0, 0)
         right, up = message.get("shift") or (0, 0)
         factor = message.get("zoom") or 1
@@ -204,13 +220,17 @@ class Viewer:
             "azimuth": self.orbit.azimuth,
             "elevation": self.orbit.elevation,
             "zoom": self.orbit.zoom,
+            "up": self.orbit.up,
+            "chosen": self.orbit.up == self.chosen_up,
+            "from": self.orbit.from_axis,
+            "told": self._told if t is self._first_transfer else "",
             "positions": t.absolute_positions().tolist(),
             "extinctions": np.asarray(t.extinctions, np.float64).tolist(),
             "colors": [svg.hex_color(c) for c in np.asarray(t.colors)],
         }
 
     def setup(self) -> dict[str, Any]:
-        """What does not change, as a message: size, range of the field, its histogram."""
+        """What does not change, as a message: size, range of the field, its histogram, names."""
         counts, _ = svg.histogram(used_values(self.volume), *self.range)
         return {
             "width": self.width,
@@ -218,6 +238,8 @@ class Viewer:
             "range": list(self.range),
             "counts": counts.tolist(),
             "field": self.volume.report.field or "values",
+            "ups": list(AXES),
+            "views": {name: list(angles) for name, angles in VIEWS.items()},
         }
 
     def _pace(self) -> Pace:
@@ -266,6 +288,21 @@ class Viewer:
 def _how(divisor: float, segments: Segments | None, transfer: TransferFunction) -> Any:
     """What a picture is compiled for."""
     return divisor, segments and segments.scalar.shape, transfer.positions.shape
+
+
+def _spans(transfer: TransferFunction, least: float, most: float) -> str:
+    """What the points of a default transfer function span, in words."""
+    first, last = transfer.absolute_positions()[[0, -1]].tolist()
+    what = "Transfer function chosen here: "
+    if first == last:
+        return f"{what}the field is {first:.4g} everywhere."
+    if (first, last) == (least, most):
+        return f"{what}it spans the whole range, {spanned(least, most, 4)}."
+    low, high = (f"{100 * q:g}" for q in QUANTILES)
+    return (
+        f"{what}it spans {spanned(first, last, 4)}, the {low} and {high} % quantiles of the "
+        f"volume; values go from {spanned(least, most, 4)}."
+    )
 
 
 def _transfer_of(transfer: Any) -> TransferFunction:

@@ -39,6 +39,7 @@ from typing import Any
 import jax
 import jaxlib.version
 
+from jaxvr._core.interpreter import python
 from jaxvr.native import cache
 
 SOURCE = Path(__file__).parent / "src"
@@ -96,8 +97,8 @@ def compiler() -> list[str] | None:
     for name in ("cc", "gcc", "clang"):
         if path := shutil.which(name):
             return [path]
-    if importlib.util.find_spec("ziglang"):
-        return [sys.executable, "-m", "ziglang", "cc"]
+    if importlib.util.find_spec("ziglang") and (program := python()):
+        return [program, "-m", "ziglang", "cc"]
     return None
 
 
@@ -204,9 +205,9 @@ _TRIAL = "import ctypes, sys; [getattr(ctypes.CDLL(sys.argv[1]), n) for n in sys
 def _try(made: Path) -> None:
     if not made.is_file():
         raise NativeError("The C compiler said nothing, and made nothing.")
-    if not sys.executable:  # Python inside of another program
+    if not (program := python()):  # inside of another program
         return
-    run = [sys.executable, "-I", "-S", "-c", _TRIAL, str(made)]
+    run = [program, "-I", "-S", "-c", _TRIAL, str(made)]
     done = subprocess.run(
         [*run, *EXPORTS], stdin=subprocess.DEVNULL, capture_output=True, timeout=TIMEOUT
     )

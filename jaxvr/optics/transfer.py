@@ -355,7 +355,8 @@ class TransferFunction:
         (float64 only where JAX allows it), for ParaView's files to JAX's default float. The rest is
         for ParaView's files: unit_distance and convention as in `from_opacity`; points: about how
         many control points to add where a curve is not linear; name: which colour map, if there are
-        several; srgb: decode colours from sRGB. Raises ValueError for neither format.
+        several; srgb: decode colours from sRGB. A colour for NaN ("NanColor") is left out without a
+        warning, since no field has NaN: a mesh refuses it. Raises ValueError for neither format.
         """
         from jaxvr.optics import transfer_json
 

@@ -28,6 +28,7 @@ from .digits import coarse_cells
 from .geometry import flat_cells, signed_volumes
 from .packing import MAX_CELLS
 from .report import MeshReport, collapse
+from .unused import gathered
 from .weld import weld
 
 # comparators of a sorting network for four keys
@@ -309,6 +310,7 @@ def build(
     if origin is None:
         origin = origin_for(exact, blocks, kind)
         exact = exact - np.asarray(origin)
+    exact = gathered(exact, [b.corners for b in blocks])
     pts = cast("points", exact, kind)
     welded, duplicates = weld(pts)
 

@@ -160,10 +160,16 @@ def list_fields(path: Any, *, max_memory: Any = _DEFAULT) -> list[Field]:
     """The fields of the mesh file at `path`, point data first.
 
     Each is a named tuple of its name, location ("point", "cell" or "corner"), number of components,
-    the names of the blocks that have it (where the file has several) and the times of its steps
-    (where it has several). `path`, `max_memory` and errors are those of `read_mesh`.
+    the names of the blocks that have it (where the file has several) and the times of the steps
+    that have it (where the file has several). Of a .pvd or .series file all steps are looked at;
+    where that takes reading more than 20 of them as a whole, a warning says which were not.
+    `path`, `max_memory` and errors are those of `read_mesh`.
     """
-    return _run("fields", _existing(path), max_memory, None, None)
+    file = _existing(path)
+    found, notes = _run("fields", file, max_memory, None, None)
+    for note in notes:
+        warnings.warn(f"{file.name}: {note}", UserWarning, stacklevel=2)
+    return found
 
 
 def read_mesh(
@@ -202,6 +208,13 @@ def read_mesh(
     among the cells are ignored (`mesh.report` counts all of these); ghost cells are left out.
     Values at the corners of cells that are no tetrahedra come as point data on points of each
     cell's own, which are welded.
+
+    Readers run in a process of their own, so that what they print, ask for or crash does not reach
+    the caller's. Inside of an application whose `sys.executable` is no Python (one frozen by
+    PyInstaller, or that embeds Python and has none beside) they run in the caller's, as the first
+    time a warning says: there is no limit of memory and time, what readers print goes to its
+    streams, VTK's messages pass by its window meanwhile, and a crash ends it.
+    `multiprocessing.set_executable` says which Python to start instead.
 
     Raises FileNotFoundError where there is no file, OSError where the disk fails, and ValueError
     for a file that is damaged, of a kind that is not supported or known, in need of a package,
@@ -268,9 +281,12 @@ def write_mesh(path: Any, mesh: TetMesh) -> None:
     has the same faces and the same picture. The field has the name it was read by, or "values".
 
     The file is there as a whole or not at all: it is made beside its place, synced and then moved
-    over what was there. Raises FileNotFoundError where there is no such folder, OSError where the
-    disk is full or may not be written, and ValueError for a name whose format meshio does not know
-    or cannot write this in.
+    over what was there. Through a link the file that it leads to is written, in the format of the
+    link's name, or of that file's where the link has no suffix.
+
+    Raises FileNotFoundError where there is no such folder, OSError where the disk is full or may
+    not be written, and ValueError for a name whose format meshio does not know or cannot write this
+    in.
     """
     file = _path(path)
     points = mesh.absolute_points() if any(mesh.origin) else np.asarray(mesh.points)
@@ -297,6 +313,7 @@ def write_mesh(path: Any, mesh: TetMesh) -> None:
         process.run(
             "write", None, None, path=str(place), points=points, tets=tets.astype(np.int64),
             name=name, values=values, location=location, workshop=str(workshop),
+            suffix=file.suffix or place.suffix,
         )  # fmt: skip
     except Trouble as e:
         shutil.rmtree(workshop, ignore_errors=True)

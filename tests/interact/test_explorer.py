@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import sys
 from typing import Any
 
@@ -72,6 +73,88 @@ def test_a_shift_moves_the_picture_with_the_hand(flat):
     np.testing.assert_allclose(orbit.target, [-0.1 * height, -0.2 * height, 0], atol=1e-9)
     out = np.asarray(orbit.camera(10, 10).eye) - orbit.target
     np.testing.assert_allclose(out, [0, 0, 5], atol=1e-5)
+
+
+UPS = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+UPS |= {f"-{n}": tuple(-x for x in up) for n, up in UPS.items()}
+# With z up: where `Camera.orbit` stands for these angles.
+SIDES = {"front": "x", "right": "y", "back": "-x", "left": "-y", "top": "z", "bottom": "-z"}
+
+
+@pytest.mark.parametrize("name", UPS)
+def test_another_axis_is_turned_up(view, mesh, name):
+    view.apply({"up": name, "turn": [5, 0]})
+    want = jaxvr.Camera.orbit(mesh, 35, 20, up=UPS[name], dtype="float64")
+    got = view.orbit.camera(8, 8, "float64")
+    np.testing.assert_allclose(got.eye, want.eye, atol=1e-5)
+    np.testing.assert_allclose(got.basis()[1], want.basis()[1], atol=1e-6)
+    assert view.state()["up"] == name
+
+
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize("name", viewer.VIEWS)
+def test_views_by_name_look_along_axes(mesh, name, flat):
+    camera = jaxvr.Camera.orbit(mesh, 12, 34, up=(0, 0, 1), zoom=2, width=SIZE, height=SIZE)
+    if flat:
+        camera = camera.replace(extent=1.0)
+    view = Viewer(mesh, TRANSFER, camera)
+    distance = np.linalg.norm(np.asarray(camera.eye) - np.asarray(camera.target))
+    view.apply({"angles": view.setup()["views"][name]})
+    _, up, forward = view.camera.basis()
+    out = UPS[SIDES[name]]
+    np.testing.assert_allclose(-forward, out, atol=1e-6)
+    # From above and below, what was in front is below or above in the picture.
+    above = {"top": UPS["-x"], "bottom": UPS["x"]}.get(name, UPS["z"])
+    np.testing.assert_allclose(up, above, atol=1e-6)
+    state = view.state()
+    assert (state["from"], state["up"]) == (SIDES[name], "z")
+    away = np.asarray(view.camera.eye) - np.asarray(view.camera.target)
+    assert np.linalg.norm(away) == pytest.approx(distance, rel=1e-5)
+    assert view.frame(True).exact
+    # A hand turns it from there, and to where there is an upper side again.
+    view.apply({"turn": [10, 0]})
+    assert view.state()["elevation"] == viewer.VIEWS[name][1]
+    view.apply({"turn": [0, -1 if name == "top" else 1]})
+    assert abs(view.state()["elevation"]) <= 89 and view.state()["from"] == ""
+
+
+def test_views_and_turns_in_one_message(view):
+    """As the script gathers them: a view by name, then turns from there."""
+    view.apply({"turn": [3, 4], "angles": [90, 0], "up": "x", "reset": ["view"], "zoom": 2})
+    state = view.state()
+    assert (state["azimuth"], state["elevation"], state["up"]) == (93, 4, "x")
+    assert state["zoom"] == pytest.approx(2 * view._first_orbit.zoom)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [{"up": "w"}, {"up": ""}, {"angles": [float("nan"), 0]}, {"angles": [0, float("inf")]}],
+    ids=str,
+)
+def test_views_that_are_none_say_so(view, message):
+    before = view.orbit
+    with pytest.raises(ValueError, match="must be"):
+        view.apply(message)
+    assert view.orbit is before
+
+
+def test_the_axis_that_was_chosen_is_told(mesh):
+    from jaxvr.defaults import best_up
+
+    # A thin plate whose field changes along it is seen from its thin side's axis.
+    points = np.asarray(mesh.points) * np.array([1, 1, 0.05], "float32")
+    plate = mesh.replace(points=points, values=np.asarray(mesh.points)[:, 0])
+    view = Viewer(plate, size=SIZE)
+    chosen = best_up(plate, view.transfer)
+    assert chosen == "z" and view.state()["up"] == "z" and view.state()["chosen"]
+    view.apply({"up": "x"})
+    assert view.state()["up"] == "x" and not view.state()["chosen"]
+    view.apply({"reset": ["view"]})
+    assert view.state()["chosen"]
+    given = Viewer(plate, camera=jaxvr.Camera.orbit(plate, up=(0, 0, 1), width=8, height=8))
+    assert given.state()["up"] == "z" and not given.state()["chosen"]
+    tilted = jaxvr.Camera.orbit(plate, up=(0, 1, 1), width=8, height=8)
+    assert Viewer(plate, camera=tilted).state()["up"] == "(0, 0.707, 0.707)"
 
 
 # The transfer function
@@ -313,6 +396,27 @@ def test_default_transfer_function_spans_the_values(mesh):
     assert Viewer(flat, size=SIZE).transfer.positions.shape == (1,)
 
 
+def test_what_the_default_transfer_function_spans_is_told(mesh):
+    """While it is shown: the 1 and 99 % quantiles by volume, or the whole range."""
+    fine = jaxvr.datasets.box((6, 6, 6), dtype="float32")
+    rising = fine.replace(values=np.linspace(0, 1, fine.n_tets), location="cell")
+    view = Viewer(rising, size=SIZE)
+    low, high = (float(view.transfer.positions[k]) for k in (0, -1))
+    told = view.state()["told"]
+    assert f"spans {low:.4g} to {high:.4g}, the 1 and 99 % quantiles" in told and 0 < low < high < 1
+    assert "values go from 0 to 1" in told
+    view.apply({"edits": [{"edit": "remove", "index": 0}]})
+    assert view.state()["told"] == ""
+    view.apply({"reset": ["transfer"]})
+    assert view.state()["told"] == told
+    assert Viewer(mesh, TRANSFER, size=SIZE).state()["told"] == ""
+    flat = mesh.replace(values=np.full(mesh.n_points, 3.0))
+    assert "the field is 3 everywhere" in Viewer(flat, size=SIZE).state()["told"]
+    two = np.where(np.arange(mesh.n_tets) < mesh.n_tets // 2, 1.0, 2.0)
+    two = mesh.replace(values=two, location="cell")
+    assert "the whole range, 1 to 2" in Viewer(two, size=SIZE).state()["told"]
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -419,6 +523,27 @@ def test_image_is_rendered_when_asked_for(explorer):
 def test_script_and_style_are_there(explorer):
     assert "export default { render }" in str(explorer._esm)
     assert ".jaxvr-explorer" in str(explorer._css)
+
+
+def test_the_script_sends_what_the_viewer_takes(explorer):
+    """Parts of a request, `p` in the script, against those in the docstring of `apply`."""
+    sent = set(re.findall(r"\bp\.([a-z]+)", str(explorer._esm))) - {"x", "e", "color"}
+    taken = set(re.findall(r"(\w+):", Viewer.apply.__doc__ or ""))
+    assert sent == taken
+    state = set(re.findall(r"\bstate\.(\w+)", str(explorer._esm)))
+    assert state <= set(explorer._viewer.state())
+    setup = set(re.findall(r"\bsetup\.(\w+)", str(explorer._esm))) | {"width", "height"}
+    assert setup == set(explorer.setup)
+
+
+def test_buttons_are_answered(explorer, mesh):
+    answer, buffers = ask(explorer, exact=True, up="z", angles=explorer.setup["views"]["top"])
+    assert (answer["state"]["up"], answer["state"]["from"]) == ("z", "z")
+    want = jaxvr.render(mesh, explorer.camera, TRANSFER, background=np.ones(3))
+    assert np.abs(pixels(buffers[0]) - 255 * np.asarray(want)[..., :3]).max() <= 0.51
+    assert list(explorer.setup["ups"]) == list(UPS)
+    answer, _ = ask(explorer, exact=False, up="north")
+    assert "up must be one of x, y, z" in answer["error"] and answer["state"]["up"] == "z"
 
 
 def test_without_anywidget_it_says_what_to_install(mesh, monkeypatch):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import warnings
 
 import jax
 import numpy as np
 import pytest
 
+import jaxvr
 from jaxvr.optics import colormaps
 from jaxvr.optics.transfer import TransferFunction
 
@@ -194,3 +196,17 @@ def test_a_binary_file_is_refused(tmp_path):
         TransferFunction.from_json(path)
     with pytest.raises(ValueError, match="readable file"):
         TransferFunction.from_json(tmp_path)
+
+
+def test_a_colour_for_nan_is_not_missed():
+    """It is left out, and the fields that would need it are refused, in words that say so."""
+    preset = paraview(NanColor=[1, 0, 0], NanOpacity=0.5, RGBPoints=RGB)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        transfer = TransferFunction.from_json(preset)
+    same = TransferFunction.from_json(paraview(RGBPoints=RGB))
+    np.testing.assert_array_equal(transfer.colors, same.colors)
+    points, tets = np.eye(4, 3), {"tetra": [[0, 1, 2, 3]]}
+    for location, values in (("point", [0, 1, np.nan, 2]), ("cell", [np.nan])):
+        with pytest.raises(ValueError, match="values has 1 NaN.* there is no colour for NaN"):
+            jaxvr.TetMesh.from_cells(points, tets, values, location=location)

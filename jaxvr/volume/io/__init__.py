@@ -8,7 +8,8 @@ starts them and keeps a few, `child` is what runs there), and what comes back is
 A reader is a function from a path and an `Ask` to a `Content` (`content`): points, cells by type
 and block, fields, steps. `registry` says which readers take a file, by its first bytes and its
 suffix, and in which order: VTK's (`vtk_files`, `vtk_data`) where the package is installed, gmsh's
-format (`gmsh`), Exodus on netCDF (`exodus`), meshio's (`meshio_files`). `sizes` compares the counts
+format (`gmsh`), Exodus on netCDF (`exodus`), meshio's (`meshio_files`); `series` has those that
+list other files. `sizes` compares the counts
 that a file claims with its size before anybody reads it, and with what came out afterwards.
 `polyhedra` cuts what is no cell of the zoo. `fields` chooses a field. `write` writes. `jobs` is
 what the process is asked for.

@@ -16,6 +16,7 @@ import os
 import pickle
 import struct
 import sys
+from collections.abc import Callable
 from typing import IO, Any
 
 TAKEN = b"!"
@@ -175,14 +176,27 @@ def main() -> None:
 
 
 def _answer(name: str, arguments: dict[str, Any], settings: dict[str, Any], said: _Quiet) -> Any:
-    """("done", result) or ("trouble", kind, message)."""
+    """As `work`, within the limits that the settings say."""
     limits = None
+    try:
+        said.take()
+        limits = _Limits(settings["memory"], settings["seconds"])
+        return work(name, arguments, said.take)
+    except MemoryError:
+        return "trouble", "large", ""
+    finally:
+        if limits is not None:
+            limits.lift()
+
+
+def work(name: str, arguments: dict[str, Any], said: Callable[[], str]) -> Any:
+    """("done", result) or ("trouble", kind, message) of a function of `jobs`."""
     try:
         from jaxvr.volume.io import jobs
 
-        said.take()
-        limits = _Limits(settings["memory"], settings["seconds"])
-        return "done", getattr(jobs, name)(said=said.take, **arguments)
+        return "done", getattr(jobs, name)(said=said, **arguments)
+    except KeyboardInterrupt:
+        raise
     except MemoryError:
         return "trouble", "large", ""
     except ImportError as e:
@@ -194,9 +208,6 @@ def _answer(name: str, arguments: dict[str, Any], settings: dict[str, Any], said
         if hasattr(e, "kind") and type(e).__name__ == "Trouble":
             return "trouble", e.kind, e.message  # type: ignore[attr-defined]
         return "trouble", "damaged", f"{type(e).__name__}: {' '.join(str(e).split())[:300]}"
-    finally:
-        if limits is not None:
-            limits.lift()
 
 
 if __name__ == "__main__":

@@ -45,12 +45,14 @@ class Field(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Ask:
     """step: which time step (an index, or a time as a float); block: names or places of blocks;
-    limit: bytes of memory, or None; vtk: whether VTK's readers may be taken."""
+    limit: bytes of memory, or None; vtk: whether VTK's readers may be taken; alone: whether the
+    process does nothing but read files, so that it may be ended and what VTK prints is known."""
 
     step: int | float | None = None
     block: Any = None
     limit: int | None = None
     vtk: bool = True
+    alone: bool = True
 
 
 @dataclasses.dataclass
@@ -65,6 +67,11 @@ class Part:
 
     def __len__(self) -> int:
         return self.nodes if isinstance(self.nodes, int) else len(self.nodes)
+
+    @property
+    def blocks(self) -> tuple[str, ...]:
+        """All blocks that they are in."""
+        return (self.block, *self.also)
 
     @property
     def solid(self) -> bool:
@@ -162,7 +169,7 @@ def require_blocks(content: Content, asked: Any) -> Content:
     if asked is None:
         return content
     kept = {content.blocks[k] for k in pick_blocks(content.blocks, asked)}
-    places = [i for i, part in enumerate(content.parts) if kept & {part.block, *part.also}]
+    places = [i for i, part in enumerate(content.parts) if kept & set(part.blocks)]
 
     def chosen(data: dict[str, list[Any]]) -> dict[str, list[Any]]:
         return {name: [a[i] for i in places] for name, a in data.items()}
@@ -182,8 +189,13 @@ def require_blocks(content: Content, asked: Any) -> Content:
 
 def join(contents: list[Content], names: list[str]) -> Content:
     """Blocks that come as contents of their own, as one. A point field that some blocks lack is NaN
-    there, and named in `point_blocks`."""
-    if len(contents) == 1:
+    there, and named in `point_blocks`. Blocks of a content's own come as "name/block"."""
+    inner = [
+        {b: f"{name}/{b}" if len(c.blocks) > 1 else name for p in c.parts for b in p.blocks}
+        or {"": name}
+        for c, name in zip(contents, names, strict=True)
+    ]
+    if len(contents) == 1 and len(contents[0].blocks) < 2:
         out = contents[0]
         for part in out.parts:
             part.block = names[0]
@@ -192,17 +204,19 @@ def join(contents: list[Content], names: list[str]) -> Content:
     point: dict[str, list[np.ndarray]] = {}
     where: dict[str, list[str]] = {}
     shapes: dict[str, tuple[Any, ...]] = {}
-    for content, name in zip(contents, names, strict=True):
+    for content, known in zip(contents, inner, strict=True):
         for key, a in content.point.items():
             shapes.setdefault(key, a.shape[1:])
             if a.shape[1:] == shapes[key] and len(content.points):
-                where.setdefault(key, []).append(name)
-    filled = [n for c, n in zip(contents, names, strict=True) if len(c.points)]
-    for content, name in zip(contents, names, strict=True):
+                has = content.point_blocks.get(key, tuple(known))
+                where.setdefault(key, []).extend(n for b, n in known.items() if b in has)
+    filled = [n for c, known in zip(contents, inner, strict=True) if len(c.points) for n in known]
+    for content, known in zip(contents, inner, strict=True):
         n = len(content.points)
         for part in content.parts:
             nodes = part.nodes if isinstance(part.nodes, int) else part.nodes + start
-            parts.append(Part(part.type, nodes, name))
+            also = tuple(known[b] for b in part.also)
+            parts.append(Part(part.type, nodes, known[part.block], also))
         for key, shape in shapes.items():
             a = content.point.get(key)
             if a is None or a.shape[1:] != shape:
@@ -240,7 +254,7 @@ def join(contents: list[Content], names: list[str]) -> Content:
         corner=rows("corner"),
         point_blocks={k: tuple(w) for k, w in where.items() if len(w) < len(filled)},
         active=contents[0].active,
-        blocks=tuple(names),
+        blocks=tuple(dict.fromkeys(n for known in inner for n in known.values())),
         notes=notes,
         reader=contents[0].reader,
         reordered=next((c.reordered for c in contents if c.reordered), ""),

@@ -17,7 +17,7 @@ def list_of(content: Content) -> list[Field]:
     found = []
     several = len(content.blocks) > 1
     solid = [i for i, part in enumerate(content.parts) if part.solid]
-    with_cells = {content.parts[i].block for i in solid}
+    with_cells = {name for i in solid for name in content.parts[i].blocks}
 
     def add(name: str, where: str, data: Any, blocks: tuple[str, ...]) -> None:
         n = components(data)
@@ -34,7 +34,7 @@ def list_of(content: Content) -> list[Field]:
     for where, group in (("cell", content.cell), ("corner", content.corner)):
         for name, arrays in group.items():
             has = [i for i in solid if arrays[i] is not None]
-            blocks = dict.fromkeys(content.parts[i].block for i in has)
+            blocks = dict.fromkeys(name for i in has for name in content.parts[i].blocks)
             if has:
                 add(name, where, arrays[has[0]], tuple(blocks))
     return found
@@ -158,7 +158,10 @@ def arrays_of(
     if not want:
         return out
     fields = list_of(content)
-    chosen, component = choose(file, fields, name, location, content.active)
+    what = file
+    if len(content.steps) > 1 and content.step is not None:
+        what = f"{file}, at time {content.steps[content.step]:g},"
+    chosen, component = choose(what, fields, name, location, content.active)
     out["label"] = label(chosen, component)
     out["location"] = chosen.location
     out["steps"] = chosen.steps

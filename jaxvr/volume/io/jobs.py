@@ -14,8 +14,9 @@ from .write import write
 __all__ = ["fields", "read", "write"]
 
 
-def fields(said: Callable[[], str], path: str, ask: Ask) -> list[Field]:
-    return choice.list_of(registry.read(Path(path), ask, said))
+def fields(said: Callable[[], str], path: str, ask: Ask) -> tuple[list[Field], list[str]]:
+    """The fields, and notes."""
+    return registry.fields(Path(path), ask, said)
 
 
 def read(

@@ -8,6 +8,7 @@ time steps are read where meshio can (XDMF). What meshio warns of goes on as a n
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -71,7 +72,23 @@ def _patched(meshio: Any, path: Path, file_format: str) -> Any:
                 return meshio.abaqus._abaqus.read_buffer(f)
     if file_format == "med":
         _without_groups(meshio.med._med)
+    if file_format == "ugrid":
+        return _ugrid(meshio, path)
     return meshio.read(path, file_format)
+
+
+def _ugrid(meshio: Any, path: Path) -> Any:
+    """meshio keeps the digits of float32 from files of text, and writes "np.int64(8)" for 8 where
+    NumPy is 2."""
+    module = meshio.ugrid._ugrid
+    if module.determine_file_type(str(path))["type"] != "ascii":
+        return meshio.read(path, "ugrid")
+    text = re.sub(rb"np\.\w+\(([^()]*)\)", rb"\1", path.read_bytes())
+    form = {"type": "ascii", "float_type": "f8", "int_type": "i8"}
+    with tempfile.TemporaryFile() as f:  # its reader needs a file of the system
+        f.write(text)
+        f.seek(0)
+        return module.read_buffer(f, form)
 
 
 def _require_flat(path: Path, file_format: str) -> None:

@@ -3,11 +3,15 @@
 At most `MOST` work at a time, whatever the number of threads; the others wait. A process that is
 idle for two minutes ends by itself, and all end with this one. One that a file ended (a crash of
 the reader, memory, time) is told as such, and the next file gets a new one.
+
+Inside of an application that is no Python (`interpreter.python` finds none) there is nothing to
+start: files are read and written here then, one at a time, without limits, and a warning says so.
 """
 
 from __future__ import annotations
 
 import atexit
+import dataclasses
 import os
 import signal
 import subprocess
@@ -15,6 +19,9 @@ import sys
 import threading
 from pathlib import Path
 from typing import Any
+
+from jaxvr._core.interpreter import python
+from jaxvr._core.warn import warn
 
 from . import child
 from .content import Trouble
@@ -35,14 +42,40 @@ class _Pool:
 _pool = _Pool()
 
 
-def _start() -> subprocess.Popen[bytes]:
-    if not sys.executable:
-        raise Trouble(
-            "system", "Files are read in a process of its own, and Python cannot start one."
+class Unguarded(UserWarning):
+    """Files are read in the caller's process, see `process`."""
+
+
+_here = threading.Lock()
+_warned = False
+
+
+def _run_here(job: str, arguments: dict[str, Any]) -> Any:
+    """An answer as of a process of its own, from this one."""
+    global _warned
+    if not _warned:
+        _warned = True
+        warn(
+            f"Files are read and written inside of {sys.executable or 'this program'}, which is no "
+            "Python that could be started: limits of memory and time do not hold, what readers "
+            "print goes to its streams, and a file that crashes a reader ends it. "
+            "multiprocessing.set_executable(path of a Python with jaxvr's packages) mends that.",
+            Unguarded,
         )
+    if "ask" in arguments:
+        arguments["ask"] = dataclasses.replace(arguments["ask"], alone=False)
+    with _here:
+        return child.work(job, arguments, _nothing_said)
+
+
+def _nothing_said() -> str:
+    return ""
+
+
+def _start(program: str) -> subprocess.Popen[bytes]:
     window = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # Windows opens one otherwise
     return subprocess.Popen(
-        [sys.executable, "-I", "-W", "ignore", str(_CHILD)],
+        [program, "-I", "-W", "ignore", str(_CHILD)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -92,13 +125,19 @@ def run(job: str, memory: int | None, seconds: float | None, **arguments: Any) -
     if _pool.pid != os.getpid():  # forked: the pipes are another's
         _pool = _Pool()
     pool = _pool
+    program = python()
+    if program is None:
+        answer = _run_here(job, arguments)
+        if answer[0] == "trouble":
+            raise Trouble(*answer[1:])
+        return answer[1]
     settings = {"path": sys.path, "memory": memory, "seconds": seconds}
     with pool.places:
         for tries_left in (1, 0):  # an idle one may have ended meanwhile
             with pool.lock:
                 process = pool.idle.pop() if pool.idle and tries_left else None
             fresh = process is None
-            process = _start() if process is None else process
+            process = _start(program) if process is None else process
             whole = taken = False
             try:
                 assert process.stdin is not None and process.stdout is not None

@@ -7,13 +7,13 @@ and a note says so.
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Callable
 from pathlib import Path
 
-from . import exodus, gmsh, meshio_files, sizes, vtk_files
-from .content import Ask, Content, Trouble, join, pick_blocks, pick_step
+from . import exodus, gmsh, meshio_files, series, sizes, vtk_files
+from .content import Ask, Content, Field, Trouble
+from .fields import list_of
 
 Reader = Callable[[Path, Ask, Callable[[], str], str], Content]
 
@@ -77,11 +77,21 @@ def suffix_of(path: Path) -> str:
     return own
 
 
+def fields(path: Path, ask: Ask, said: Callable[[], str]) -> tuple[list[Field], list[str]]:
+    """The fields of a file, of all its steps, and what is to be told of them."""
+    content = read(path, ask, said)
+    found = list_of(content)
+    suffix = suffix_of(path)
+    if suffix not in series.SUFFIXES or len(content.steps) < 2:
+        return found, []
+    return series.fields(path, ask, said, suffix, read, found, content.step or 0)
+
+
 def known() -> list[str]:
     """All suffixes that some reader takes."""
     import meshio
 
-    own = [*vtk_files.READERS, *vtk_files.SAME, *OWN, ".pvd", ".series"]
+    own = [*vtk_files.READERS, *vtk_files.SAME, *OWN, *series.SUFFIXES]
     return sorted({*own, *meshio.extension_to_filetypes})
 
 
@@ -121,8 +131,8 @@ def read(path: Path, ask: Ask, said: Callable[[], str]) -> Content:
 
 def _read(path: Path, ask: Ask, said: Callable[[], str]) -> Content:
     suffix = suffix_of(path)
-    if suffix in (".pvd", ".series"):
-        return _series(path, ask, said, suffix)
+    if suffix in series.SUFFIXES:
+        return series.read(path, ask, said, suffix, read)
     readers = [gmsh.read] if suffix == ".msh" and _is_gmsh(path) else _readers(suffix, ask.vtk)
     if not readers:
         raise Trouble("suffix", _unknown(path, suffix))
@@ -190,23 +200,3 @@ def _unknown(path: Path, suffix: str) -> str:
         f"{what}, and its first bytes do not tell its format. Suffixes that are read: "
         f"{' '.join(known())}. If another program reads it, save it as .vtu there."
     )
-
-
-def _series(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
-    entries = vtk_files.members(path, suffix)
-    times = tuple(sorted({t for t, _, _ in entries}))
-    step = pick_step(times, ask.step)
-    here = [(name, file) for t, name, file in entries if t == times[step]]
-    inner = dataclasses.replace(ask, step=None, block=None)
-    if len(here) == 1:
-        content = read(here[0][1], dataclasses.replace(ask, step=None), said)
-    else:
-        names = tuple(name for name, _ in here)
-        chosen = pick_blocks(names, ask.block)
-        content = join([read(here[k][1], inner, said) for k in chosen], [names[k] for k in chosen])
-        content.blocks = names
-    content.raw = None
-    content.step = step
-    if len(times) > 1:
-        content.steps = times
-    return content

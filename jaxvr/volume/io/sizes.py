@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 from .content import Content, Trouble
 
@@ -27,6 +28,7 @@ _RATIO = {
 _PARTS = {".pvd", ".series", ".pvtu", ".pvti", ".pvtr", ".pvts", ".vtm", ".vtmb", ".vtpd", ".vtpc",
           ".case", ".encas", ".xdmf", ".xmf", ".foam"}  # fmt: skip
 Counts = dict[str, int]
+COUNTED = (".vtu", ".vtk", ".pvtu", ".vtm")  # whose headers tell what has to come out
 
 
 def volume_of(path: Path, suffix: str) -> int:
@@ -63,6 +65,8 @@ def claims(path: Path, suffix: str) -> Counts:
         return _vtu(path, size)
     if suffix == ".vtk":
         return _legacy(path, size)
+    if suffix in (".pvtu", ".vtm"):
+        return _listed(path, suffix)
     if suffix == ".ugrid":
         return _ugrid(path, size)
     return {}
@@ -101,6 +105,25 @@ def _vtu(path: Path, size: int) -> Counts:
     return found
 
 
+def _listed(path: Path, suffix: str) -> Counts:
+    """The sum over the .vtu files that a file lists; nothing where there are others among them."""
+    tag, key = ("Piece", "Source") if suffix == ".pvtu" else ("DataSet", "file")
+    try:
+        entries = ElementTree.fromstring(path.read_bytes()).iter(tag)
+        files = [path.parent / e.attrib[key] for e in entries if e.get(key)]
+    except ElementTree.ParseError:
+        return {}  # its reader says what is wrong
+    if any(file.suffix != ".vtu" for file in files):
+        return {}
+    found: Counts = {"points": 0, "cells": 0}
+    for file in files:
+        if not file.is_file():
+            raise Trouble("damaged", f"it names {file.name!r}, which is not there")
+        for what, n in _vtu(file, file.stat().st_size).items():
+            found[what] += n
+    return found
+
+
 def _legacy(path: Path, size: int) -> Counts:
     with open(path, "rb") as f:
         text = f.read()
@@ -131,9 +154,10 @@ def _ugrid(path: Path, size: int) -> Counts:
     with open(path, "rb") as f:
         head = f.read(4096)
     try:
-        if m := re.fullmatch(r"\.(l?)(?:b|r)(4|8)l?", kind):
-            at = 4 if ".r" in kind or kind.startswith(".lr") else 0
-            numbers = np.frombuffer(head, "<i4" if m[1] else ">i4", 7, at).tolist()
+        if m := re.fullmatch(r"\.(l?)(b|r)(?:4|8)(l?)", kind):
+            width = 8 if m[3] else 4
+            at = width if m[2] == "r" else 0
+            numbers = np.frombuffer(head, f"{'<' if m[1] else '>'}i{width}", 7, at).tolist()
             least = 4
         else:
             words = re.sub(rb"np\.\w+\(([^()]*)\)", rb"\1", head).split()  # by NumPy 2
@@ -142,4 +166,4 @@ def _ugrid(path: Path, size: int) -> Counts:
         raise Trouble("damaged", "its seven counts cannot be read") from None
     for n, what in zip(numbers, ("points", "triangles", "quads", "tetra", "pyramids", "wedges", "hexahedra")):  # noqa: E501  # fmt: skip
         _bound(n, what, 3 * least if what == "points" else least, size)
-    return {}
+    return {"points": numbers[0], "cells": sum(numbers[1:])} if len(numbers) == 7 else {}

@@ -7,15 +7,15 @@ the file is what is read.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-import json
 import re
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
+from . import sizes
 from .content import Ask, Content, Trouble, pick_step
 from .vtk_data import content_of
 
@@ -51,6 +51,7 @@ SAME = {
     ".ex2": ".e", ".exo": ".e", ".exii": ".e", ".g": ".e", ".encas": ".case", ".tec": ".dat",
     ".tp": ".dat", ".ucd": ".avs", ".xmf": ".xdmf",
 }  # fmt: skip
+_COMPOSITE = (".vtm", ".vtmb", ".vtpd", ".vtpc")
 _TROUBLE = re.compile(r"(?:ERR\||ERROR: In|Error:|Generic Warning: In.*(?:[Ee]rror|[Uu]nable))")
 
 
@@ -78,25 +79,31 @@ def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
         ):
             getattr(reader, f"ReadAll{what}On")()
     if suffix == ".dat":
+        if not ask.alone:
+            raise Trouble("unsupported", f"{name} may wait for ever, and cannot be ended here")
         _require_soon(2 + path.stat().st_size / 5e5)
-    reader.UpdateInformation()
-    steps = _times(reader)
-    _switch_on(reader, suffix)
-    step = None
-    if steps:
-        step = pick_step(steps, ask.step)
-        reader.UpdateTimeStep(steps[step])
-    else:
-        reader.Update()
+    with _heard(ask.alone) as heard:
+        reader.UpdateInformation()
+        steps = _times(reader)
+        _switch_on(reader, suffix)
+        step = None
+        if steps:
+            step = pick_step(steps, ask.step)
+            reader.UpdateTimeStep(steps[step])
+        else:
+            reader.Update()
+        told = heard()
     if suffix == ".dat" and hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_PROF, 0)
     data = reader.GetOutputDataObject(0)
-    told = " ".join(said().split())
+    told = " ".join((told + said()).split())
     found = _TROUBLE.search(told)
     if found:
         raise Trouble("damaged", f"{name}: {_plain(told[found.start() :])}")
     content = content_of(data, ask.block, ask.limit, path.name)
     content.reader = name
+    if suffix in sizes.COUNTED and ask.block is None:
+        content.raw = data.GetNumberOfPoints(), data.GetNumberOfCells()
     content.steps = steps if len(steps) > 1 else ()
     content.step = step
     if suffix == ".vtk":
@@ -104,6 +111,23 @@ def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
     if told:
         content.notes.append(f"{name} says: {_plain(told)}")
     return content
+
+
+@contextlib.contextmanager
+def _heard(alone: bool) -> Iterator[Callable[[], str]]:
+    """What VTK says meanwhile, where this process is the caller's and its streams are left alone:
+    a window of VTK's takes it, in the place of the caller's."""
+    if alone:
+        yield lambda: ""
+        return
+    from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
+
+    window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
+    vtkOutputWindow.SetInstance(window)
+    try:
+        yield window.GetOutput
+    finally:
+        vtkOutputWindow.SetInstance(before)
 
 
 def _require_soon(seconds: float) -> None:
@@ -117,6 +141,7 @@ def _require_soon(seconds: float) -> None:
 def _plain(told: str) -> str:
     """VTK's messages without time stamps, addresses and places in its source."""
     told = re.sub(r"\(\s*[0-9.]+s\)\s*\[[^\]]*\]\s*", "", told)
+    told = re.sub(r"(ERROR|Warning): In \S+\.cxx, line \d+", "", told)
     told = re.sub(r"\S+\.cxx:\d+\s*(ERR|WARN)\|\s*", "", told)
     told = re.sub(r"\((?:0x)?[0-9a-f]{6,}\)", "", told)
     return told[:300]
@@ -155,27 +180,16 @@ def _switch_on(reader: Any, suffix: str) -> None:
                 getattr(reader, f"Set{what}ArrayStatus")(name, 1)
 
 
-def members(path: Path, suffix: str) -> list[tuple[float, str, Path]]:
-    """(time, name of the part, file) of each entry of a .pvd or .series file. Raises Trouble."""
-    try:
-        if suffix == ".series":
-            entries = json.loads(path.read_text("utf-8"))["files"]
-            found = [(float(e["time"]), "", path.parent / e["name"]) for e in entries]
-        else:
-            sets = ElementTree.fromstring(path.read_bytes()).iter("DataSet")
-            found = [
-                (
-                    float(e.get("timestep") or 0),
-                    e.get("name") or e.get("part") or "0",
-                    path.parent / e.attrib["file"],
-                )
-                for e in sets
-            ]
-    except (ValueError, KeyError, TypeError, ElementTree.ParseError) as e:
-        raise Trouble("damaged", f"it is no collection of files: {type(e).__name__}: {e}") from None
-    if not found:
-        raise Trouble("damaged", "it lists no files.")
-    for _, _, file in found:
-        if not file.is_file():
-            raise Trouble("damaged", f"it names {file.name!r}, which is not there.")
-    return found
+def names(path: Path, suffix: str) -> set[tuple[str, str]] | None:
+    """(name, location) of the arrays in a file of VTK's XML by its header; None for other files."""
+    module, name = READERS.get(suffix, ("", ""))
+    if module != "vtkIOXML" or suffix in _COMPOSITE:
+        return None
+    reader = getattr(importlib.import_module(f"vtkmodules.{module}"), name)()
+    reader.SetFileName(str(path))
+    reader.UpdateInformation()
+    return {
+        (getattr(reader, f"Get{what}ArrayName")(k), what.lower())
+        for what in ("Point", "Cell")
+        for k in range(getattr(reader, f"GetNumberOf{what}Arrays")())
+    }

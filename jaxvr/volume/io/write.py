@@ -32,8 +32,10 @@ def write(
     values: np.ndarray,
     location: str,
     workshop: str,
+    suffix: str,
 ) -> None:
-    """location: "point" or "cell". workshop: a folder to make, beside the file. Raises Trouble."""
+    """location: "point" or "cell". workshop: a folder to make, beside the file. suffix: of the
+    format; the file, that a link may lead to, may have another one. Raises Trouble."""
     import meshio
 
     file = Path(path)
@@ -44,11 +46,11 @@ def write(
     folder = Path(workshop)
     try:
         folder.mkdir(mode=0o700)
-        made = folder / file.name
+        made = folder / (file.name if file.suffix == suffix else file.name + suffix)
         mesh.write(made)
-        if file.suffix.lower() not in _WHOLE:
+        if suffix.lower() not in _WHOLE:
             _require_whole(made, len(tets), name, location, said)
-        _move(folder, file)
+        _move(made, file)
     except OSError as e:
         if e.errno is None and "requested and" in str(e):  # of NumPy, where a write fell short
             raise Trouble("system", f"{errno.ENOSPC}:{os.strerror(errno.ENOSPC)}") from e
@@ -81,7 +83,8 @@ def _require_whole(made: Path, n: int, name: str, location: str, said: Callable[
         )
 
 
-def _move(folder: Path, file: Path) -> None:
-    """The files of a folder to the place of `file`, which comes last."""
-    for made in sorted(folder.iterdir(), key=lambda p: p.name == file.name):
-        move(made, file.parent / made.name)
+def _move(made: Path, file: Path) -> None:
+    """The files beside `made` to the place of `file`, and then `made` as `file`."""
+    for other in sorted(p for p in made.parent.iterdir() if p != made):
+        move(other, file.parent / other.name)
+    move(made, file)
