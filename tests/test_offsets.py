@@ -132,6 +132,18 @@ def test_ordinary_data_have_no_offsets(dtype):
     assert constant.offset == 0
 
 
+@pytest.mark.parametrize("exponent", [-40, 3, 40])
+def test_units_that_are_powers_of_two(both, exponent):
+    """As everywhere, bits do not depend on them."""
+    unit = 2.0**exponent
+    away, scale = FIELDS["pascal"]
+    corner, size = PLACES["utm"]
+    moved = Scene((unit * away, unit * scale), (unit * np.asarray(corner), unit * size))
+    assert moved.mesh.offset == unit * both.mesh.offset
+    assert moved.mesh.origin == tuple(unit * x for x in both.mesh.origin)
+    assert np.array_equal(moved.image(), both.image())
+
+
 def test_numbers_that_no_cell_uses_do_not_count():
     points = np.concatenate([POINTS + 1e6, [[0, 0, 0]]])
     values = np.concatenate([FIELD + 1e6, [0]])
@@ -264,7 +276,7 @@ def test_positions_that_float32_makes_one():
 
 def test_a_camera_and_its_origin(both):
     camera, mesh = both.camera, both.mesh
-    assert camera.origin == (450010, 5200010, 0)  # near its target
+    assert camera.origin == (450000, 5200000, 0)  # near its target
     eye, target = camera.absolute()
     assert np.abs(eye - (10 * EYE + both.corner)).max() < 1e-5
     for same in (
@@ -284,7 +296,7 @@ def test_a_camera_and_its_origin(both):
     assert np.abs(jaxvr.render(mesh, orbit, both.transfer) - both.image()).max() < 1e-4
     flat = Camera.orthographic(eye, target, extent=12.0, width=5, height=5, dtype="float32")
     assert jaxvr.render(mesh, flat, both.transfer)[2, 2, 3] > 0.5
-    assert "relative to (450010, 5200010, 0)" in repr(camera)
+    assert "relative to (450000, 5200000, 0)" in repr(camera)
 
 
 def test_a_camera_goes_through_vtk(both):
@@ -321,9 +333,9 @@ def test_a_mesh_gives_back_the_world(both, near, tmp_path):
     image = jaxvr.render(finer, both.camera, both.transfer)
     assert np.abs(image - both.image()).max() < 2e-5  # linear in each cell before and after
     text = mesh.describe()
-    assert "(450000, 5200000, 0): points are held relative to it" in text
+    assert "(450008, 5200008, 0): points are held relative to it" in text
     assert "101325" in text and "5200010" in text
-    assert "5200000" in repr(mesh) and "held relative" in (mesh._repr_html_() or "")
+    assert "5200008" in repr(mesh) and "held relative" in (mesh._repr_html_() or "")
     for name, of in (("points", "origin"), ("values", "offset")):
         with pytest.raises(ValueError, match=f"{name} are held relative to {of} = .*Say what"):
             mesh.replace(**{name: getattr(mesh, name)})

@@ -9,8 +9,9 @@ the object that holds them (`TetMesh.origin` and `offset`, `TransferFunction.off
 `Camera.origin`, `Segments.offset`), part of its structure and no leaf. Whoever brings two objects
 together takes the difference of their offsets, in float64 again.
 
-An offset is 0 for most data, and for all in float64. It is a decimal as short as the range allows,
-so that people can read it and two objects made of the same data agree.
+An offset is 0 for most data, and for all in float64. It is a multiple of the power of two below the
+range, so that in another unit by a power of two pictures keep their bits, and two objects made of
+about the same numbers agree.
 """
 
 from __future__ import annotations
@@ -33,13 +34,14 @@ FAR = 32.0
 
 
 def offset_between(low: float, high: float, dtype: Any, width: float | None = None) -> float:
-    """What to take off numbers from `low` to `high`: a decimal in their middle, or 0.0 where
-    `dtype` holds them well. width: the length that their rounding counts against, if not theirs."""
+    """What to take off numbers from `low` to `high`: one near their middle, or 0.0 where `dtype`
+    holds them well. width: the length that their rounding counts against, if not theirs."""
     width = high - low if width is None else width
     largest = max(abs(low), abs(high))
     if np.dtype(dtype) != np.float32 or not 0 < width < math.inf or largest <= FAR * width:
         return 0.0
-    return float(round(low + (high - low) / 2, -math.floor(math.log10(width))))
+    unit = math.ldexp(1.0, math.frexp(width)[1] - 1)
+    return round((low + (high - low) / 2) / unit) * unit
 
 
 def bulk(x: np.ndarray) -> tuple[float, float]:

@@ -18,6 +18,8 @@ _COARSE = 1e-3
 # The part of the different values that has to stay different. Of millions, so dense that it does
 # not matter, a tenth falls together.
 _KEPT = 0.75
+# A part of the largest value that is noise in float64.
+_NOISE = 2.0**-40
 # More distinct values than this may fall together and be dense all the same.
 _MANY = 1 << 21
 
@@ -50,20 +52,23 @@ def coarse_cells(
 def lost_values(given: Any, numbers: np.ndarray, offset: float, dtype: np.dtype) -> str | None:
     """What to say of numbers (n,), float64 and as they are, of which too few digits are left."""
     low, high = bulk(numbers)
-    step = float(np.spacing(np.float32(max(abs(low), abs(high)))))
-    came_single = not isinstance(given, dict) and _is_single(given)
-    if came_single and offset_between(low, high, np.float32) and step > _COARSE * (high - low):
+    if _is_single(given):
+        step = float(np.spacing(np.float32(max(abs(low), abs(high)))))
+        if not offset_between(low, high, np.float32) or step <= _COARSE * (high - low):
+            return None
         return (
             f"values come in float32, which has steps of {step:.2g} there: most of them lie from "
             f"{low:.9g} to {high:.9g}, {(high - low) / step:.0f} steps. What was lost is not to be "
             "had back: write them in float64, or less an offset."
         )
-    if dtype == np.float64 or came_single or not high - low < np.inf:
+    largest = float(np.abs(numbers).max())
+    if dtype == np.float64 or not 0 < largest < float(np.finfo(dtype).max):
         return None
-    distinct = np.unique(numbers)
+    # Values of float64 that are one but for noise of its own count once.
+    distinct = np.unique(np.round(numbers * (1 / (largest * _NOISE)))) * (largest * _NOISE)
     if len(distinct) > _MANY:
         return None
-    kept = len(np.unique((distinct - offset).astype(np.float32)))
+    kept = len(np.unique((distinct - offset).astype(dtype)))
     if kept > _KEPT * len(distinct):
         return None
     return (

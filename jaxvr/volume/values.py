@@ -62,12 +62,23 @@ def choose_location(
     raise ValueError(f"values must have shape {_describe(sizes)}, but has {shape}.")
 
 
+def is_whole(given: Any) -> bool:
+    """Whether values are integers, of all types of cells."""
+    if isinstance(given, Mapping):
+        return all(is_whole(v) for v in given.values())
+    try:
+        return (
+            np.dtype(given.dtype if hasattr(given, "dtype") else np.asarray(given).dtype).kind
+            in "iu"
+        )
+    except ValueError:
+        return False  # an entry for points, lines or faces, which nobody reads
+
+
 def offset_for(given: Any, x: np.ndarray, dtype: np.dtype) -> float:
     """What to hold numbers (n,), float64, relative to: see `offsets`."""
     offset = offset_between(*bulk(x), dtype)
-    kinds = {np.asarray(v).dtype.kind for v in given.values()} if isinstance(given, Mapping) else ()
-    whole = kinds or {np.dtype(getattr(given, "dtype", float)).kind}
-    if not offset and dtype == np.float32 and whole <= {"i", "u"}:
+    if not offset and dtype == np.float32 and is_whole(given):
         low, high = float(x.min()), float(x.max())  # whole numbers are to stay what they are
         if max(-low, high) > 2**24 and high - low < 2**24:
             offset = float(round((low + high) / 2))
@@ -91,7 +102,8 @@ def place(
             mark[built.cells.reshape(-1)] = True
             used = exact[mark]
         offset = offset_for(values, used, dtype)
-        lost = lost_values(values, used, offset, dtype)
+        if not is_whole(values):  # `rounded` looks at these
+            lost = lost_values(values, used, offset, dtype)
         exact = exact - offset
     return cast("values", exact, dtype), where, offset, lost
 
