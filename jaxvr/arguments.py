@@ -5,7 +5,6 @@ Each raises a `ValueError` that says what was found.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -19,7 +18,7 @@ from jaxvr._core.checks import (
     require_finite,
     require_kind,
 )
-from jaxvr._core.offsets import FAR, NOWHERE, Origin, relative, said
+from jaxvr._core.offsets import FAR, Origin, relative, said
 from jaxvr._core.warn import warn
 from jaxvr.adjoint import AbstractAdjoint, Replay
 from jaxvr.composite import Over
@@ -48,19 +47,6 @@ def dtype_of(volume: Any) -> Any:
     return volume.scalar.dtype if isinstance(volume, Segments) else volume.points.dtype
 
 
-def _cast(tree: Any, dtype: Any) -> Any:
-    return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), tree)
-
-
-def bare(x: Any) -> Any:
-    """A mesh, camera, segments or transfer function without its offset, which compiled functions
-    need not know: for another one they are not compiled again."""
-    if isinstance(x, TransferFunction):
-        return TransferFunction.tree_unflatten(0.0, x.tree_flatten()[0])
-    blank = {"origin": NOWHERE, "offset": 0.0}
-    return dataclasses.replace(x, **{name: to for name, to in blank.items() if hasattr(x, name)})
-
-
 def volume_of(volume: Any) -> TetMesh:
     require_kind("volume", volume, TetMesh, "Read files with jaxvr.read_mesh.")
     require_mesh(volume)
@@ -77,8 +63,7 @@ def camera_of(camera: Any, volume: Any) -> Camera:
     dtype = dtype_of(volume)
     if camera.origin != volume.origin:
         _require_digits(camera, volume.origin)
-        camera = _cast(camera, jnp.promote_types(camera.dtype, dtype)).relative_to(volume.origin)
-    return _cast(camera, dtype)
+    return camera.relative_to(volume.origin, dtype)
 
 
 def _require_digits(camera: Camera, origin: Origin) -> None:
@@ -106,11 +91,7 @@ def transfer_of(transfer: Any, volume: Any) -> TransferFunction:
     transfer = TransferFunction(
         transfer.positions, transfer.colors, transfer.extinctions, offset=transfer.offset
     )
-    dtype = dtype_of(volume)
-    if transfer.offset != volume.offset:
-        transfer = _cast(transfer, jnp.promote_types(transfer.dtype, dtype))
-        transfer = transfer.relative_to(volume.offset)
-    return _cast(transfer, dtype)
+    return transfer.relative_to(volume.offset, dtype_of(volume))
 
 
 def segments_of(segments: Any) -> Segments:

@@ -17,11 +17,10 @@ import numpy as np
 from jax import lax
 
 from jaxvr._core.checks import is_concrete
-from jaxvr._core.offsets import absolute
+from jaxvr._core.offsets import absolute, bare
 from jaxvr._core.status import check
 from jaxvr.adjoint.base import Operands, Pipeline, advance, begin, busy, shade_piece
 from jaxvr.arguments import (
-    bare,
     camera_of,
     integrator_of,
     rays_of,

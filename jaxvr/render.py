@@ -24,6 +24,7 @@ from jax import lax
 from jaxvr import hints
 from jaxvr import native as compiled
 from jaxvr._core.checks import is_concrete
+from jaxvr._core.offsets import bare
 from jaxvr._core.status import BROKEN, LOST, check
 from jaxvr.adjoint import AbstractAdjoint, Pipeline
 from jaxvr.adjoint.base import Operands, refusing
@@ -31,7 +32,6 @@ from jaxvr.adjoint.replay import settle
 from jaxvr.arguments import (
     adjoint_of,
     background_of,
-    bare,
     camera_of,
     compositor_of,
     dtype_of,

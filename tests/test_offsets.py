@@ -299,6 +299,18 @@ def test_a_camera_and_its_origin(both):
     assert "relative to (450000, 5200000, 0)" in repr(camera)
 
 
+def test_a_camera_in_float32_of_a_mesh_in_float64(both):
+    """The mesh has no origin, the camera has: it is widened before that is put back."""
+    double = Scene(FIELDS["pascal"], PLACES["utm"], "float64")
+    assert double.mesh.origin == (0, 0, 0) != both.camera.origin
+    image = jaxvr.render(double.mesh, both.camera, both.transfer)
+    assert np.abs(image - double.image()).max() < 1e-5
+    exact, right = (exact_order(double.mesh, c) for c in (both.camera, double.camera))
+    assert np.array_equal(exact.table, right.table)
+    k = [int(jaxvr.measure_k(double.mesh, c).k) for c in (both.camera, double.camera)]
+    assert k[0] == k[1]
+
+
 def test_a_camera_goes_through_vtk(both):
     pytest.importorskip("vtk")
     again = Camera.from_vtk(both.camera.to_vtk(), 20, 16, dtype="float32")

@@ -16,6 +16,7 @@ about the same numbers agree.
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -42,6 +43,22 @@ def offset_between(low: float, high: float, dtype: Any, width: float | None = No
         return 0.0
     unit = math.ldexp(1.0, math.frexp(width)[1] - 1)
     return round((low + (high - low) / 2) / unit) * unit
+
+
+def origin_between(low: np.ndarray, high: np.ndarray, dtype: Any) -> Origin:
+    """The same for points in a box (3,), (3,): each coordinate by itself."""
+    x, y, z = (offset_between(float(a), float(b), dtype) for a, b in zip(low, high, strict=True))
+    return x, y, z
+
+
+def bare(x: Any) -> Any:
+    """What is held relative to an offset without it. Compiled functions need not know of it: for
+    another one they are not compiled again."""
+    made = copy.copy(x)
+    for name, none in (("origin", NOWHERE), ("offset", 0.0)):
+        if hasattr(x, name):
+            object.__setattr__(made, name, none)
+    return made
 
 
 def bulk(x: np.ndarray) -> tuple[float, float]:

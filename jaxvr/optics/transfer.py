@@ -305,13 +305,15 @@ class TransferFunction:
         """The positions (K,) as scalars are, float64: with the offset. Not inside `jit`."""
         return absolute(self.positions, self.offset)
 
-    def relative_to(self, offset: float) -> TransferFunction:
-        """The same function with its positions relative to another offset. Differentiable."""
-        offset = offset_of(offset)
-        positions = moved(self.positions, self.offset, offset, self.dtype)
-        made = object.__new__(TransferFunction)
-        _set(made, positions, self.colors, self.extinctions, offset)
-        return made
+    def relative_to(self, offset: float, dtype: Any = None) -> TransferFunction:
+        """The same function with its positions relative to another offset. Differentiable.
+
+        dtype: as for `Camera.relative_to`.
+        """
+        offset, dtype = offset_of(offset), self.dtype if dtype is None else dtype
+        positions = moved(self.positions, self.offset, offset, dtype)
+        others = (jnp.asarray(x).astype(dtype) for x in (self.colors, self.extinctions))
+        return TransferFunction.tree_unflatten(offset, (positions, *others))
 
     @property
     def dtype(self) -> np.dtype:

@@ -43,7 +43,7 @@ class View(NamedTuple):
 
 def look(mesh: TetMesh, camera: Camera) -> View:
     """Rays are the camera's own, with the roundings that they have."""
-    camera = camera.relative_to(mesh.origin)
+    camera = camera.relative_to(mesh.origin, np.promote_types(camera.dtype, mesh.dtype))
     origins, directions = (np.asarray(x, np.float64).reshape(-1, 3) for x in camera.local_rays())
     points, eye = np.asarray(mesh.points, np.float64), np.asarray(camera.eye, np.float64)
     size = max(float(np.abs(points).max()), float(np.abs(eye).max()))

@@ -496,7 +496,7 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
         # The tags: a segment that ends on the boundary leads outside, and the next two inside.
         inside = found & ~outside
         outside = jnp.where(found, inside & (second.words[1] < 0), outside)
-    begin, end = (lax.stop_gradient(z) for z in (jnp.where(start.cut, start.at.z, one.z), two.z))
+    begin, end = lax.stop_gradient(at.z), lax.stop_gradient(two.z)
     # A segment of no length has a derivative, where that is not a matter of more than rounding: so
     # has one that ends at the eye, which the next makes up for.
     flat = (segment.length == 0) & (after.lead == 0) & (jnp.maximum(begin, end) >= 0)

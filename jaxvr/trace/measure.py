@@ -24,7 +24,7 @@ import numpy as np
 from jax import lax
 
 from jaxvr._core.checks import is_concrete
-from jaxvr._core.offsets import NOWHERE
+from jaxvr._core.offsets import bare
 from jaxvr._core.units import require_lengths
 from jaxvr.order import AbstractOrder, Centroid
 from jaxvr.trace.faces import CellFaces, cell_faces
@@ -103,10 +103,9 @@ def measure_k(
         )
     require_mesh(volume)
     require_lengths("volume.points", volume.points)
-    camera = camera.relative_to(volume.origin)
-    camera = jax.tree.map(lambda x: jnp.asarray(x).astype(volume.dtype), camera)
+    camera = camera.relative_to(volume.origin, volume.dtype)
     rays, count = batches(batch_size(volume.dtype), tuple(tile(x) for x in camera.local_rays()))
-    source = _prepare(dataclasses.replace(volume, origin=NOWHERE, offset=0.0))
+    source = _prepare(bare(volume))
     sort = Sort(order or Centroid(), reverse=direction == "back to front")
     number, size, _ = rays[0].shape
     out, all_batches = np.zeros((3, number, size), np.int32), np.arange(number)

@@ -275,13 +275,16 @@ class Camera:
         new = old | changes | {"origin": origin}
         return _make(**new, dtype=self.dtype)
 
-    def relative_to(self, origin: Any) -> Camera:
-        """The same view with eye and target relative to another origin (3,). Differentiable."""
-        origin = origin_of(origin)
-        eye, target = (
-            moved_to(x, self.origin, origin, self.dtype) for x in (self.eye, self.target)
-        )
-        return dataclasses.replace(self, eye=eye, target=target, origin=origin)
+    def relative_to(self, origin: Any, dtype: Any = None) -> Camera:
+        """The same view with eye and target relative to another origin (3,). Differentiable.
+
+        dtype: what the camera is cast to, its own if None; of it and its own the wider one is
+        subtracted in.
+        """
+        origin, dtype = origin_of(origin), self.dtype if dtype is None else dtype
+        eye, target = (moved_to(x, self.origin, origin, dtype) for x in (self.eye, self.target))
+        camera = dataclasses.replace(self, eye=eye, target=target, origin=origin)
+        return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), camera)
 
     def absolute(self) -> tuple[np.ndarray, np.ndarray]:
         """eye and target (3,), (3,) in the world, float64. Not inside `jit`."""

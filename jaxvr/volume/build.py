@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from .._core.checks import as_floats, default_float, float_dtype, is_concrete, require_finite
-from .._core.offsets import NOWHERE, Origin, offset_between
+from .._core.offsets import NOWHERE, Origin, origin_between
 from .._core.units import scaled_to_one
 from . import cells as zoo
 from . import connectivity as conn
@@ -124,8 +124,7 @@ def origin_for(points: np.ndarray, blocks: list[Block], dtype: np.dtype) -> Orig
     for b in blocks:
         used[b.corners] = True
     low, high = points[used].min(axis=0), points[used].max(axis=0)
-    x, y, z = (offset_between(float(a), float(b), dtype) for a, b in zip(low, high, strict=True))
-    return x, y, z
+    return origin_between(low, high, dtype)
 
 
 def read_indices(name: str, x: Any, nodes: int | None, corners: int, n_points: int) -> np.ndarray:

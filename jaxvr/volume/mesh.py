@@ -16,8 +16,8 @@ from .._core.offsets import (
     NOWHERE,
     Origin,
     absolute,
-    offset_between,
     offset_of,
+    origin_between,
     origin_of,
     require_said,
     said,
@@ -209,11 +209,8 @@ class TetMesh:
             if points.shape == self.points.shape and is_concrete(self.cells):
                 cells = np.asarray(self.cells)
                 low, high = points[cells].min((0, 1)), points[cells].max((0, 1))
-                x, y, z = (
-                    offset_between(float(a), float(b), self.dtype)
-                    for a, b in zip(low, high, strict=True)
-                )
-                place, points = (x, y, z), points - (x, y, z)
+                place = origin_between(low, high, self.dtype)
+                points = points - place
         return self._floats("points", points), place
 
     def _values(self, values: Any, offset: Any) -> tuple[Array, float]:
