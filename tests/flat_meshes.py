@@ -92,8 +92,10 @@ def moved(mesh: FlatMesh, by: float = 0.02, seed: int = 1) -> np.ndarray:
 def one_sided(f: Callable[[float], Any], h: float) -> float:
     """Derivative of f at 0 from the side of h, extrapolated to step 0 from three steps."""
 
+    start = float(f(0.0))
+
     def slope(h: float) -> float:
-        return (float(f(h)) - float(f(0.0))) / h
+        return (float(f(h)) - start) / h
 
     return (8 * slope(h / 4) - 6 * slope(h / 2) + slope(h)) / 3
 
