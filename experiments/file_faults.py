@@ -103,8 +103,9 @@ def outcome(path: Path, how: dict[str, Any]) -> str:
     return "a mesh" if sound else "AN UNSOUND MESH"
 
 
-def mutants(count: int, seed: int) -> dict[str, Any]:
-    rng = random.Random(seed)
+def mutants(count: int, seed: int, first: int = 0) -> dict[str, Any]:
+    """Files `first` to `first` + `count` of those that a seed makes: each has numbers of its own,
+    so that one that is read wrongly can be made again alone."""
     if unknown := set(SOURCES) - {kind.name for kind in file_formats.KINDS}:
         raise ValueError(f"There are no kinds {sorted(unknown)}.")
     found: collections.Counter[str] = collections.Counter()
@@ -124,17 +125,17 @@ def mutants(count: int, seed: int) -> dict[str, Any]:
                 print(f"left out: {kind.name} ({type(e).__name__}: {e})")
                 continue
             sources.append((kind.name, made.path, made.path.read_bytes(), made))
-        for k in range(count):
+        for k in range(first, first + count):
             name, path, raw, made = sources[k % len(sources)]
             how = {key: v for key, v in made.how.items() if key == "values"}
-            path.write_bytes(mutate(raw, rng))
+            path.write_bytes(mutate(raw, random.Random(f"{seed} {k}")))
             start = time.perf_counter()
             said = outcome(path, how)
             took = time.perf_counter() - start
             slowest = max(slowest, (took, name))
             found[said] += 1
             if not said.startswith(("error:", "a mesh")):
-                print(f"{name}: {said}")
+                print(f"file {k}, {name}: {said}")
             path.write_bytes(raw)
             if (k + 1) % 1000 == 0:
                 print(k + 1, dict(found), f"slowest {slowest[0]:.1f} s", flush=True)
@@ -296,6 +297,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="place of the first mutant")
     parser.add_argument("--out", type=Path, help="folder for file_faults.json")
     arguments = parser.parse_args(argv)
     report: dict[str, Any] = {}
@@ -303,7 +305,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         ("disks", disks),
         ("threads", lambda: threads(arguments.seconds)),
         ("kills", lambda: kills(arguments.kills)),
-        ("mutants", lambda: mutants(arguments.mutants, arguments.seed)),
+        ("mutants", lambda: mutants(arguments.mutants, arguments.seed, arguments.first)),
     ):
         report[name] = run()
         print(name, json.dumps(report[name], indent=1), flush=True)

@@ -417,6 +417,11 @@ def test_what_no_offset_helps_is_told():
     with pytest.warns(UserWarning) as told:
         TetMesh.from_cells(np.asarray(box.points), {"tetra": box.cells}, halves, dtype="float32")
     assert any("different values: they lie in places far" in str(w.message) for w in told)
+    given = np.asarray(box.points), {"tetra": box.cells}
+    for scale in (1e-60, 1e-309):  # the latter below the normal numbers of float64, too
+        with pytest.warns(UserWarning) as told:
+            TetMesh.from_cells(*given, scale * FIELD, dtype="float32")
+        assert any("different values: they are too near 0" in str(w.message) for w in told)
     single = (101325 + 0.01 * FIELD).astype(np.float32)
     with pytest.warns(UserWarning) as told:
         TetMesh.from_cells(np.asarray(box.points), {"tetra": box.cells}, single)

@@ -6,6 +6,7 @@ far from each other, nor for digits that were lost before, in files and arrays o
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,8 @@ _COARSE = 1e-3
 # The part of the different values that has to stay different. Of millions, so dense that it does
 # not matter, a tenth falls together.
 _KEPT = 0.75
-# A part of the largest value that is noise in float64.
-_NOISE = 2.0**-40
+# Bits of the largest value below which there is noise in float64.
+_BITS = 40
 # More distinct values than this may fall together and be dense all the same.
 _MANY = 1 << 21
 
@@ -64,18 +65,25 @@ def lost_values(given: Any, numbers: np.ndarray, offset: float, dtype: np.dtype)
     largest = float(np.abs(numbers).max())
     if dtype == np.float64 or not 0 < largest < float(np.finfo(dtype).max):
         return None
-    # Values of float64 that are one but for noise of its own count once.
-    distinct = np.unique(np.round(numbers * (1 / (largest * _NOISE)))) * (largest * _NOISE)
+    # Values of float64 that are one but for noise of its own count once. By powers of two, which
+    # have no reciprocal to overflow where all values are below the normal numbers.
+    unit = math.frexp(largest)[1] - _BITS
+    distinct = np.ldexp(np.unique(np.round(np.ldexp(numbers, -unit))), unit)
     if len(distinct) > _MANY:
         return None
     kept = len(np.unique((distinct - offset).astype(dtype)))
     if kept > _KEPT * len(distinct):
         return None
+    small = largest < float(np.finfo(dtype).tiny)
+    where, else_ = (
+        ("are too near 0 for it", "scale them")
+        if small
+        else ("lie in places far from each other", "leave out what is far")
+    )
     return (
-        f"float32 keeps {kept} of the {len(distinct)} different values: they lie in places far "
-        f"from each other, from {numbers.min():.9g} to {numbers.max():.9g}. Turn on x64 "
-        '(jax.config.update("jax_enable_x64", True)) and pass dtype="float64", or leave out what '
-        "is far."
+        f"float32 keeps {kept} of the {len(distinct)} different values: they {where}, from "
+        f"{numbers.min():.9g} to {numbers.max():.9g}. Turn on x64 "
+        f'(jax.config.update("jax_enable_x64", True)) and pass dtype="float64", or {else_}.'
     )
 
 
