@@ -5,7 +5,8 @@
 A mutant may be refused with a ValueError that names the file, or give what was stored; of a JSON
 text it may be another function too, where numbers were changed. Anything else is a fault. Kills
 come at a random time while a process writes one state after the other; the file must then be one of
-those states. Places are tried as another user where the process is root.
+those states (of whole fits: `experiments.fit_kills`). Places are tried as another user where the
+process is root.
 """
 
 from __future__ import annotations
