@@ -328,6 +328,81 @@ def test_cameras_and_rays_that_lost_their_digits_are_told(both):
         )
 
 
+def test_positions_that_lost_their_digits_are_told(both):
+    x = 101325 + 0.01 * np.linspace(FIELD.min(), FIELD.max(), 5)
+    few = "positions come in float32, which has steps of 0.0078 there: they lie from 101325.* 2 st"
+    others = COLORS, EXTINCTIONS
+    for single in (jnp.asarray(x, jnp.float32), x.astype(np.float32)):
+        for make in (
+            lambda x: TransferFunction(x, *others),
+            lambda x: TransferFunction(x, *others, offset=0, dtype="float64"),
+            lambda x: TransferFunction.from_colormap("viridis", x, EXTINCTIONS),
+            lambda x: TransferFunction.from_opacity(x, "viridis", np.full(5, 0.1)),
+            lambda x: both.transfer.replace(positions=x, offset=0),
+            lambda x: both.transfer.resample(x),
+        ):
+            with pytest.warns(UserWarning, match=few) as told:
+                made = make(single)
+            assert len(told) == 1 and told[0].filename == __file__
+    # One that came out of `jit`, where nobody knows, is told beside a mesh, once.
+    lost = jax.tree.unflatten(
+        jax.tree.structure(both.transfer.relative_to(0)),
+        [jnp.asarray(a, jnp.float32) for a in (x, *others)],
+    )
+    for verb in (jaxvr.render, lambda *a: jaxvr.probe(a[0], a[1], a[2])):
+        with pytest.warns(UserWarning, match=few) as told:
+            verb(both.mesh, both.camera, lost)
+        assert sum("come in float32" in str(w.message) for w in told) == 1
+    near = jnp.asarray([101325.0, 101325.01, 101340.0], jnp.float32)  # one gap of one step
+    with pytest.warns(UserWarning, match="steps of 0.0078 there.*1920 steps"):
+        made = TransferFunction(near, COLORS[:3], EXTINCTIONS[:3], dtype="float32")
+    assert made.offset == 0
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_positions_that_kept_their_digits_are_not_told(both, dtype):
+    """Warnings are errors."""
+    fine = 101325 + np.linspace(0.0, 300.0, 5)
+    others = COLORS, EXTINCTIONS
+    for kept in (
+        jnp.asarray([101325, 101325.5, 101326, 101327, 101328], jnp.float32),  # whole steps
+        jnp.asarray(fine + 0.3, jnp.float32),  # enough of them
+        jnp.asarray(np.linspace(0, 2e5, 5) + 0.3, jnp.float32),
+        jnp.full(5, 101325.01, jnp.float32)[:2],
+        jnp.asarray(fine - 101325 + 0.01, jnp.float32),
+        101325 + 0.01 * np.linspace(0, 1, 5),
+        (101325 + 0.01 * np.linspace(0, 1, 5)).tolist(),
+        np.arange(101325, 101330),
+    ):
+        n = len(kept)
+        made = TransferFunction(kept, COLORS[:n], EXTINCTIONS[:n], dtype=dtype)
+        assert jax.tree.map(lambda leaf: leaf, made).offset == made.offset
+    tf = both.transfer.replace(positions=both.transfer.positions, offset=both.transfer.offset)
+    assert tf.scaled(2.0).astype(dtype).offset == tf.offset
+    x = jnp.asarray(101325 + 0.01 * np.linspace(FIELD.min(), FIELD.max(), 5), jnp.float32)
+
+    @jax.jit
+    def picture(x):  # nobody knows the numbers
+        return jaxvr.render(both.mesh, both.camera, TransferFunction(x, *others))[..., 3].sum()
+
+    assert np.isfinite(picture(x)) and np.isfinite(jax.jit(jax.grad(picture))(x)).all()
+
+
+def test_a_fit_tells_of_lost_digits_at_its_start_and_end_only(both):
+    x = jnp.asarray(101325 + 0.01 * np.linspace(FIELD.min(), FIELD.max(), 3), jnp.float32)
+    with pytest.warns(UserWarning, match="positions come in float32"):
+        start = TransferFunction(x, COLORS[:3], EXTINCTIONS[:3] / both.size)
+    seen = []
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        jaxvr.fit(
+            *(start, both.mesh, [both.camera], [both.image()]), iterations=6, progress=False,
+            callback=lambda i, loss, tf: seen.append(tf.absolute_positions()),
+        )  # fmt: skip
+    assert len(seen) == 6
+    assert 1 <= sum("come in float32" in str(w.message) for w in told) <= 2
+
+
 def test_a_mesh_gives_back_the_world(both, near, tmp_path):
     pytest.importorskip("vtk")
     mesh = both.mesh

@@ -24,6 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .checks import is_concrete
+
 Origin = tuple[float, float, float]
 
 NOWHERE: Origin = (0.0, 0.0, 0.0)
@@ -87,6 +89,36 @@ def moved(x: Any, here: Any, there: Any, dtype: Any) -> Any:
 def absolute(x: Any, offset: Any) -> np.ndarray:
     """x + offset in float64."""
     return np.asarray(x, np.float64) + np.asarray(offset, np.float64)
+
+
+# Fewer steps of float32 than these between two numbers, and between all of them, are too few.
+_STEPS, _ALL_STEPS = 16, 1000
+
+
+def coarse(x: Any) -> str | None:
+    """What to say of sorted, finite numbers (n,) that come in less than float64, far from 0 and so
+    close together that digits are lost; None where all are kept, and for numbers that are traced.
+
+    Whole multiples of 16 steps are taken for what was meant: 101325 and 101326 lose nothing.
+    """
+    dtype = getattr(x, "dtype", None)
+    if dtype not in (np.float16, np.float32) or not is_concrete(x) or len(x) == 0:
+        return None
+    x = np.asarray(x, np.float64)
+    low, high = float(x[0]), float(x[-1])
+    if not offset_between(low, high, np.float32):
+        return None
+    step = float(np.spacing(np.asarray(max(abs(low), abs(high)), dtype)))
+    gaps = np.diff(x)
+    if min(gaps[gaps > 0]) >= _STEPS * step and high - low >= _ALL_STEPS * step:
+        return None
+    if not (x % (_STEPS * step)).any():
+        return None
+    return (
+        f"come in {np.dtype(dtype)}, which has steps of {step:.2g} there: they lie from {low:.9g} "
+        f"to {high:.9g}, {(high - low) / step:.0f} steps. What was lost is not to be had back: "
+        "pass plain numbers or NumPy's float64, or less an offset that is said with offset=."
+    )
 
 
 def said(offset: Any) -> str:

@@ -26,7 +26,15 @@ from jaxvr._core.checks import (
     require_finite,
     require_shape,
 )
-from jaxvr._core.offsets import absolute, moved, offset_between, offset_of, relative, require_said
+from jaxvr._core.offsets import (
+    absolute,
+    coarse,
+    moved,
+    offset_between,
+    offset_of,
+    relative,
+    require_said,
+)
 from jaxvr._core.warn import warn
 from jaxvr.optics import colormaps
 
@@ -39,7 +47,9 @@ class TransferFunction:
     """A piecewise linear map from scalars to colours and extinctions, with K control points.
 
     positions (K,):   scalar values, never decreasing; two equal ones are a jump, three an error.
-        However near two others are, they are none. Relative to `offset`.
+        However near two others are, they are none. Relative to `offset`. Where digits were lost
+        before they came, as in JAX's float32 far from 0, a warning says how many are left; inside
+        `jit` nobody knows.
     colors (K, 3):    linear RGB; any finite number (above 1 for lights brighter than white).
         Integers above 1 are an error, since they are taken for 8-bit colours.
     extinctions (K,): per unit of length, >= 0, any size.
@@ -71,6 +81,7 @@ class TransferFunction:
         dtype: Any = None,
     ):
         dtype = common_float(dtype, positions, colors, extinctions)
+        given, told = positions, offset
         positions, offset = _less_offset(positions, offset, dtype)
         _require_unit_colors("colors", colors)
         colors = as_floats("colors", colors, ndim=2, dtype=dtype)
@@ -85,6 +96,8 @@ class TransferFunction:
         require_finite("extinctions", extinctions)
         _require_sorted(positions)
         _require_nonnegative(extinctions)
+        if not told:  # else they are relative to it
+            _tell_coarse(given)
         _set(self, jnp.asarray(positions), jnp.asarray(colors), jnp.asarray(extinctions), offset)
 
     # JAX's register_dataclass would run `__init__`, and its checks, at every unflatten.
@@ -130,10 +143,12 @@ class TransferFunction:
         """
         if not is_concrete(positions):
             raise ValueError("from_colormap needs known positions; call it outside jit and grad.")
-        dtype = common_float(dtype, positions, extinctions)
+        dtype, given = common_float(dtype, positions, extinctions), positions
         positions = np.asarray(as_floats("positions", positions, ndim=1, dtype=np.float64))
         require_finite("positions", positions)
         _require_sorted(positions)
+        if not offset:
+            _tell_coarse(given)  # the constructor sees float64
         if not isinstance(colormap, str) and not callable(colormap):
             _require_unit_colors("The colour table", colormap)
         colors = colormaps.sample(colormap, _span(positions), srgb=srgb)
@@ -238,11 +253,14 @@ class TransferFunction:
         Where `positions` names a position twice, the two get the values on either side of it, so
         jumps survive when they are named; else a jump becomes a ramp between its new neighbours.
         """
+        given = positions
         if self.offset:
             positions = relative(_wide("positions", positions), self.offset, self.dtype)
         positions = as_floats("positions", positions, ndim=1, dtype=self.dtype)
         require_finite("positions", positions)
         _require_sorted(positions)
+        if self.offset:  # without one the constructor tells
+            _tell_coarse(given)
         if positions.shape[0] == 0:
             raise ValueError("resample needs at least one position, but got none.")
         return self._resampled(jnp.asarray(positions))
@@ -452,6 +470,12 @@ def _less_offset(positions: Any, offset: Any, dtype: Any) -> tuple[Any, float]:
             UserWarning,
         )
     return held, away
+
+
+def _tell_coarse(positions: Any) -> None:
+    """Warns of digits that sorted positions, as they came, had lost before."""
+    if said := coarse(positions):
+        warn(f"positions {said}", UserWarning)
 
 
 def _wide(name: str, x: Any) -> Any:
