@@ -54,8 +54,9 @@ def run(path: Path | None, out: Path, compiled: Path, ready: Callable[[], Any]) 
     keep = {} if path is None else {"checkpoint": path, "checkpoint_every": 1, "resume": True}
     found = jaxvr.fit(
         *(start, volume, cameras, targets), iterations=STEPS, rays=20, progress=False,
-        callback=lambda *_: ready(), **keep,
+        callback=lambda *_: ready() is None, **keep,  # what is true would end it
     )  # fmt: skip
+    assert len(found.loss_history) == STEPS
     leaves = [found.loss_history, *jax.tree.leaves(found.transfer)]
     out.write_bytes(b"".join(np.asarray(x).tobytes() for x in leaves))
 

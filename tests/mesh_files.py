@@ -1,4 +1,4 @@
-"""For tests on files of meshes: kinds by name, and reading without warnings."""
+"""For tests on files of meshes: kinds by name, text, and reading without warnings."""
 
 import warnings
 from typing import Any
@@ -7,6 +7,17 @@ from experiments import file_formats, file_kinds
 from jaxvr.volume import TetMesh, read_mesh
 
 BY_NAME = {k.name: k for k in file_formats.KINDS}
+
+# How a file of gmsh begins whose elements are of the physical groups 7 and 8.
+MSH_OF_TWO_BLOCKS = """$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$PhysicalNames
+2
+3 7 "lower part"
+3 8 "upper part"
+$EndPhysicalNames
+"""
 
 
 def quietly(path: Any, *args: Any, **kwargs: Any) -> TetMesh:

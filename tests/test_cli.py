@@ -14,6 +14,7 @@ import pytest
 import jaxvr
 from jaxvr.cli import main
 from jaxvr.defaults import UPS, best_up
+from tests.mesh_files import MSH_OF_TWO_BLOCKS
 from tests.stand_ins import flow_fields, named, ring
 
 pytestmark = pytest.mark.usefixtures("quick_code")
@@ -57,15 +58,7 @@ def test_info_plot3d_solution(file_of, capsys):
     assert "pressure" in out and f"{want.min():.4g}" in out and f"{want.max():.4g}" in out, out
 
 
-STEPS_AND_BLOCKS = """$MeshFormat
-2.2 0 8
-$EndMeshFormat
-$PhysicalNames
-2
-3 7 "lower part"
-3 8 "upper part"
-$EndPhysicalNames
-$Nodes
+STEPS_AND_BLOCKS = f"""{MSH_OF_TWO_BLOCKS}$Nodes
 5
 1 0 0 0
 2 1 0 0

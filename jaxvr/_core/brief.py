@@ -35,10 +35,15 @@ def brief(x: Any) -> str:
 
 def spanned(low: Any, high: Any, digits: int = 6) -> str:
     """Two numbers as "low to high", with as many digits as tell them apart, so many at least."""
+    return " to ".join(ends(low, high, digits))
+
+
+def ends(low: Any, high: Any, digits: int = 6) -> tuple[str, str]:
+    """The same as two texts."""
     low, high = float(low), float(high)
     while digits < 17 and low != high and _part(low, high, digits) > 1e-3:
         digits += 1
-    return f"{low:.{digits}g} to {high:.{digits}g}"
+    return f"{low:.{digits}g}", f"{high:.{digits}g}"
 
 
 def _part(low: float, high: float, digits: int) -> float:

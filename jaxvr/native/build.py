@@ -7,7 +7,8 @@ that holds everything it depends on, and a digest of itself (see `cache`).
     JAXVR_NATIVE=0    use JAX's own loops only; asked at every call
     JAXVR_CC          the C compiler, with options; else cc, gcc or clang, else that of `ziglang`
                       (pip install ziglang; the extra `native`)
-    JAXVR_CACHE       the folder for compiled libraries; else jaxvr in the user's cache folder
+    JAXVR_CACHE       the folder for compiled libraries; else (also where it is blank) jaxvr in the
+                      user's cache folder
 
 Nothing that goes wrong here is an exception of `render`: there is a reason, one warning for it, and
 JAX's loops. A library that was loaded stays for the life of the process. A reason does not: it
@@ -120,8 +121,8 @@ def _processor() -> str:
 
 def cache_folder() -> tuple[Path, str | None]:
     """Where libraries are kept, and what to say where that is no place for long."""
-    chosen = os.environ.get("JAXVR_CACHE")
-    return (Path(chosen).expanduser(), None) if chosen else cache.default_folder()
+    chosen = os.environ.get("JAXVR_CACHE", "")
+    return (Path(chosen).expanduser(), None) if chosen.strip() else cache.default_folder()
 
 
 def build(dtype: str) -> Path:
@@ -165,6 +166,8 @@ def _build(dtype: str) -> Path:
             _compile([*run, "-o", str(made), "-lm"], scratch, shown=shlex.join(run))
             _try(made)
             target = cache.publish(made, folder, name)
+        if target.stem != f"{name}-{cache.digest_of(target)}":
+            remark = f"A folder stands where a library belongs, which is now {target}: remove it."
         if remark:
             _say(remark)
         return target

@@ -19,6 +19,7 @@ import shutil
 import stat
 import tempfile
 import time
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -134,15 +135,31 @@ def find(folder: Path, name: str) -> Path | None:
 
 
 def remove(file: Path) -> None:
+    """A file, or an empty folder in the place of one."""
     with contextlib.suppress(OSError):
-        file.unlink()
+        if _is_folder(file):
+            file.rmdir()
+        else:
+            file.unlink()
+
+
+def _is_folder(file: Path) -> bool:
+    return file.is_dir() and not file.is_symlink()
 
 
 def publish(made: Path, folder: Path, name: str) -> Path:
-    """Moves a finished library to its place, at once, so that processes may build side by side."""
+    """Moves a finished library to its place, at once, so that processes may build side by side.
+
+    Where a folder has its name, which nothing replaces, another part goes before the digest.
+    """
     made.chmod(0o700)
     sync(made)
-    target = folder / f"{name}-{digest_of(made)}.so"
+    digest = digest_of(made)
+    target = folder / f"{name}-{digest}.so"
+    if _is_folder(target):
+        remove(target)
+    if _is_folder(target):
+        target = folder / f"{name}-{uuid.uuid4().hex[:8]}-{digest}.so"
     made.replace(target)  # whose mode does not count, as it does in `writing.move`
     with contextlib.suppress(OSError):  # not all file systems have it
         sync(folder)

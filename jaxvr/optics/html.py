@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxvr._core import svg
-from jaxvr._core.brief import is_known, spanned
+from jaxvr._core.brief import ends, is_known
 
 if TYPE_CHECKING:
     from jaxvr.optics.transfer import TransferFunction
@@ -24,13 +24,12 @@ def transfer_html(transfer: TransferFunction) -> str | None:
     if not is_known(*leaves):
         return None
     x, colors, e = (np.asarray(leaf, np.float64) for leaf in leaves)
-    scalars = [f"{v + transfer.offset:.4g}" for v in x[[0, -1]]] if x.ndim == 1 and len(x) else []
-    if transfer.offset and scalars:
-        scalars = spanned(*transfer.absolute_positions()[[0, -1]]).split(" to ")
     if x.ndim != 1 or len(x) == 0 or colors.shape != (len(x), 3) or e.shape != x.shape:
         return None
     if not all(np.isfinite(a).all() for a in (x, colors, e)) or (np.diff(x) < 0).any():
         return None  # of the same structure but no transfer function: a gradient, say
+    known = transfer.absolute_positions()
+    scalars = ends(known[0], known[-1], 4)
     at, top = _places(x), float(e.max())
     level = FLOOR - (FLOOR - TOP) * np.maximum(e, 0) / (top if top > 0 else 1.0)
     curve = [(0.0, level[0]), *zip(at, level, strict=True), (WIDTH, level[-1])]

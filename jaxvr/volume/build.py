@@ -28,7 +28,7 @@ from .digits import coarse_cells
 from .geometry import flat_cells, signed_volumes
 from .packing import MAX_CELLS
 from .report import MeshReport, collapse
-from .unused import gathered
+from .unused import gathered, used_by
 from .weld import weld
 
 # comparators of a sorting network for four keys
@@ -118,12 +118,9 @@ def read_points(points: Any) -> np.ndarray:
     return out
 
 
-def origin_for(points: np.ndarray, blocks: list[Block], dtype: np.dtype) -> Origin:
-    """What to hold points (P, 3) relative to (see `offsets`), by those that cells use."""
-    used = np.zeros(len(points), bool)
-    for b in blocks:
-        used[b.corners] = True
-    low, high = points[used].min(axis=0), points[used].max(axis=0)
+def origin_for(points: np.ndarray, dtype: np.dtype) -> Origin:
+    """What to hold points (n, 3) that cells use relative to: see `offsets`."""
+    low, high = points.min(axis=0), points.max(axis=0)
     return origin_between(low, high, dtype)
 
 
@@ -306,10 +303,11 @@ def build(
     """
     kind, exact = mesh_dtype(points, dtype), read_points(points)
     blocks, reduced, ignored = read_blocks(cells, len(exact))
+    used = used_by(len(exact), *(b.corners for b in blocks))
     if origin is None:
-        origin = origin_for(exact, blocks, kind)
+        origin = origin_for(exact[used], kind)
         exact = exact - np.asarray(origin)
-    exact = gathered(exact, [b.corners for b in blocks])
+    exact = gathered(exact, used)
     pts = cast("points", exact, kind)
     welded, duplicates = weld(pts)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import packing
+from .unused import used_by
 
 FACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # face k omits vertex k
 
@@ -49,8 +50,7 @@ def match_faces(welded_rows: np.ndarray) -> np.ndarray:
     Raises NonManifoldError where three or more cells meet in a face or a cell stands there twice.
     """
     n = len(welded_rows)
-    used = np.zeros(int(welded_rows.max()) + 1, bool)
-    used[welded_rows] = True
+    used = used_by(int(welded_rows.max()) + 1, welded_rows)
     rank = np.cumsum(used, dtype=np.int64) - 1  # few bits, so that a face packs into one word
     order, same = _face_order(rank[welded_rows])
     third = same[1:] & same[:-1]

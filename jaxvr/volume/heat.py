@@ -11,6 +11,7 @@ from .connectivity import FACES
 from .mesh import TetMesh, _from_cells
 from .packing import cell_of, corner_of
 from .structured import grid_cells
+from .unused import used_by
 
 FIN, GAP = 0.4, 0.6  # widths across, cm
 BASE, FIN_HEIGHT, DEPTH = 0.8, 2.4, 4.0  # cm
@@ -104,9 +105,7 @@ def _mesh(fins: int, r: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     left, right = lattice[flat == _LEFT], lattice[flat == _RIGHT]
     cells["wedge"] = np.concatenate([left[:, [0, 2, 1, 4, 6, 5]], right[:, [0, 3, 1, 4, 7, 5]]])
     points, cells["pyramid"], cells["tetra"] = _mixed(points, lattice[flat == _MIXED])
-    used = np.zeros(len(points), bool)
-    for c in cells.values():
-        used[c] = True
+    used = used_by(len(points), *cells.values())
     number = np.cumsum(used) - 1
     return points[used], {t: number[c] for t, c in cells.items()}
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .geometry import signed_volumes
+from .unused import used_by
 
 if TYPE_CHECKING:
     from .mesh import TetMesh
@@ -24,9 +25,7 @@ def _values(mesh: TetMesh) -> np.ndarray:
 
 def used_points(mesh: TetMesh) -> np.ndarray:
     """Which points (P,) cells use."""
-    used = np.zeros(mesh.n_points, bool)  # a mark for each is quicker than a copy of each corner
-    used[np.asarray(mesh.cells).reshape(-1)] = True
-    return used
+    return used_by(mesh.n_points, np.asarray(mesh.cells))
 
 
 def used_values(mesh: TetMesh) -> np.ndarray:

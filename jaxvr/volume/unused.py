@@ -1,12 +1,10 @@
-"""Points that no cell uses, where they would spoil the numbers of the others.
+"""Which points cells use, and what to do with others that would spoil their numbers.
 
 Verbs compute in units in which the largest coordinate is near 1. A fill value among coordinates
 (1e20, 9.97e36) of a point without a cell would take all digits from those of cells.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,12 +14,17 @@ from .._core.warn import warn
 FAR = 2.0**40
 
 
-def gathered(points: np.ndarray, corners: Sequence[np.ndarray]) -> np.ndarray:
-    """The points (P, 3), those that no cell uses and that lie far out in the middle of the others,
-    with a warning. corners: point ids of the cells, one array for each type."""
-    used = np.zeros(len(points), bool)
-    for ids in corners:
+def used_by(n: int, *cells: np.ndarray) -> np.ndarray:
+    """Which of n points (n,) bool cells use. cells: ids, one array of any shape for each type."""
+    used = np.zeros(n, bool)  # a mark for each is quicker than a copy of each corner
+    for ids in cells:
         used[ids.reshape(-1)] = True
+    return used
+
+
+def gathered(points: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """The points (P, 3), those that no cell uses and that lie far out in the middle of the others,
+    with a warning. used (P,): from `used_by`."""
     if used.all() or not used.any():
         return points
     size = np.abs(points).max(axis=1)

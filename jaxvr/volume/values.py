@@ -15,6 +15,7 @@ from .._core.checks import is_concrete
 from .._core.offsets import bulk, offset_between
 from .build import Built, cast, numbers
 from .digits import lost_values
+from .unused import used_by
 
 LOCATIONS = ("point", "cell", "corner")
 
@@ -96,11 +97,7 @@ def place(
     exact, where = _place(values, built, location)
     dtype, lost = built.points.dtype, None
     if offset is None:
-        used = exact.reshape(-1)
-        if where == "point":
-            mark = np.zeros(len(exact), bool)
-            mark[built.cells.reshape(-1)] = True
-            used = exact[mark]
+        used = exact[used_by(len(exact), built.cells)] if where == "point" else exact.reshape(-1)
         offset = offset_for(values, used, dtype)
         if not is_whole(values):  # `rounded` looks at these
             lost = lost_values(values, used, offset, dtype)

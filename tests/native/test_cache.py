@@ -69,7 +69,7 @@ FAULTS = {
     "another program": lambda f: f.write_bytes(Path(sys.executable).read_bytes()[:100_000]),
     "written by others": lambda f: f.chmod(0o722),
     "a link": to_link,
-    "a folder": lambda f: (f.unlink(), f.mkdir()),
+    "an empty folder": lambda f: (f.unlink(), f.mkdir()),
 }
 
 
@@ -78,13 +78,23 @@ def test_unsound_files_are_made_again(folder, fault):
     first = build.build("float32")
     assert build.build("float32") == first and calls(folder) == 1
     FAULTS[fault](first)
-    if fault == "a folder":  # which nothing can replace
-        with pytest.raises(build.NativeError):
-            build.build("float32")
-        return
     again = build.build("float32")
     assert calls(folder) == 2 and cache.is_sound(again)
     assert not again.is_symlink() and stat.S_IMODE(again.stat().st_mode) & 0o022 == 0
+
+
+def test_a_folder_in_the_place_of_a_library(folder, monkeypatch):
+    """The library gets another name, once, and a warning says so."""
+    monkeypatch.setattr(build, "_said", set())
+    first = build.build("float32")
+    first.unlink()
+    first.mkdir()
+    (first / "kept").write_text("")
+    with pytest.warns(RuntimeWarning, match="A folder stands where a library belongs.*remove it"):
+        again = build.build("float32")
+    assert again != first and cache.is_sound(again) and (first / "kept").exists()
+    assert build.build("float32") == again and calls(folder) == 2
+    assert build._open(again) is not None
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root gives away")
@@ -238,6 +248,15 @@ def test_a_relative_cache_folder_is_passed_over(monkeypatch, tmp_path, relative)
     assert cache.default_folder() == (tmp_path / "home/.cache/jaxvr", None)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     assert cache.default_folder() == (tmp_path / "xdg/jaxvr", None)
+
+
+@pytest.mark.parametrize("blank", ["", " ", "\t \n"])
+def test_a_blank_name_of_the_folder_is_none(monkeypatch, tmp_path, blank):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    monkeypatch.setenv("JAXVR_CACHE", blank)
+    assert build.cache_folder() == (tmp_path / "caches" / "jaxvr", None)
 
 
 @pytest.mark.parametrize("home", [None, "here"])

@@ -10,17 +10,9 @@ from experiments import file_makers
 from jaxvr.volume import Field, datasets, list_fields, read_mesh, write_mesh
 from jaxvr.volume.io import process
 from jaxvr.volume.io.content import Ask, Trouble
-from tests.mesh_files import BY_NAME, quietly, volume
+from tests.mesh_files import BY_NAME, MSH_OF_TWO_BLOCKS, quietly, volume
 
-CORNER = """$MeshFormat
-2.2 0 8
-$EndMeshFormat
-$PhysicalNames
-2
-3 7 "lower part"
-3 8 "upper part"
-$EndPhysicalNames
-$Nodes
+CORNER = f"""{MSH_OF_TWO_BLOCKS}$Nodes
 5
 10 0 0 0
 20 1 0 0
