@@ -3,10 +3,10 @@
     python -m experiments.fit_kills [--kills N] [--seed N] [--json FILE]
 
 A process runs `jaxvr.fit` with a checkpoint after each step and is killed (SIGKILL) at a random
-time. A new process resumes it, is killed too, and so on, a few times; the last one is left alone.
-Losses and transfer function must then be those of a fit that nobody disturbed, to the bit, and
-nothing may lie beside the checkpoint. What a kill leaves there on the way is counted: it shows how
-many of them hit a file that was being written.
+moment of a random step, now and then before the first. A new process resumes it, is killed too, and
+so on, a few times; the last one is left alone. Losses and transfer function must then be those of a
+fit that nobody disturbed, to the bit, and nothing may lie beside the checkpoint. What a kill leaves
+there on the way is counted: it shows how many of them hit a file that was being written.
 
 Processes are forked from one that has imported jaxvr and computed nothing.
 """
@@ -31,9 +31,9 @@ import numpy as np
 
 import jaxvr
 
-STEPS = 300
+STEPS = 100
 IN_A_ROW = 4  # kills of one fit, before it may end
-EARLY = 0.25  # the part of kills that may come before the first step
+EARLY = 0.2  # the part of kills that come before the first step
 
 
 def run(path: Path | None, out: Path, compiled: Path, ready: Callable[[], Any]) -> None:
@@ -81,9 +81,14 @@ class Process:
                 os._exit(code)
         os.close(writing)
 
-    def first_step(self) -> bool:
-        """Waits for it; whether there was one."""
-        return os.read(self._reading, 1) == b"s"
+    def wait(self, steps: int) -> float:
+        """Until it has made so many steps; the seconds that one takes, from the second on."""
+        times = []
+        for k in range(steps):
+            if os.read(self._reading, 1) != b"s":
+                raise RuntimeError(f"A fit ended after {k} steps.")
+            times.append(time.perf_counter())
+        return (times[-1] - times[0]) / max(steps - 1, 1)
 
     def end(self, kill: bool = False) -> int:
         """Its status."""
@@ -109,11 +114,9 @@ def kills(number: int, folder: Path, rng: random.Random) -> Counter[str]:
     found = Counter[str]()
     right, compiled = folder / "right", folder / "compiled"
     whole = Process(None, right, compiled)
-    whole.first_step()
     if whole.end():
         raise RuntimeError("The fit that nobody kills fails.")
-    start_up = seconds = 1.0
-    done = 0
+    start_up, done = 1.0, 0
     while done < number:
         place = folder / f"fit {done}"
         place.mkdir()
@@ -124,8 +127,8 @@ def kills(number: int, folder: Path, rng: random.Random) -> Counter[str]:
             if rng.random() < EARLY:
                 time.sleep(rng.uniform(0, start_up))
             else:
-                fit.first_step()
-                time.sleep(rng.uniform(0, seconds * (STEPS - before) / STEPS / 2))
+                step = fit.wait(rng.randint(2, max(2, (STEPS - before) // 2)))
+                time.sleep(rng.uniform(0, step))
             status = fit.end(kill=True)
             done += 1
             found["kills that left a file beside"] += any(p != path for p in place.iterdir())
@@ -142,12 +145,9 @@ def kills(number: int, folder: Path, rng: random.Random) -> Counter[str]:
                 found["fault: an error" if status else "had ended"] += 1
         began = time.perf_counter()
         fit = Process(path, out, compiled)
-        before = steps_in(path)
-        fit.first_step()
-        start_up, began = time.perf_counter() - began, time.perf_counter()
-        ended = fit.end() == 0
-        seconds = max(time.perf_counter() - began, 1e-3) * STEPS / max(STEPS - before, 1)
-        same = ended and out.read_bytes() == right.read_bytes()
+        fit.wait(1)
+        start_up = time.perf_counter() - began
+        same = fit.end() == 0 and out.read_bytes() == right.read_bytes()
         found["resumed, equal to the bit" if same else "fault: another result"] += 1
         if list(place.iterdir()) != [path]:
             found["fault: left behind"] += 1

@@ -5,8 +5,9 @@ lengths) and in Kraus, Qiao and Ebert 2004 (logarithmic lengths). The table's le
 the longest segment there can be, its scalars from the first control point to the last; what lies
 outside of them has constant colour and extinction, and its part of a segment is integrated exactly.
 
-doi:10.1109/VISUAL.2000.885683, doi:10.1145/383507.383515, doi:10.1109/TVCG.2005.46,
-doi:10.1109/VISUAL.2004.85
+"Hardware-accelerated volume and isosurface rendering based on cell-projection" (Roettger et al.),
+doi:10.1145/383507.383515 (Engel et al.), "Hardware-assisted visibility sorting for unstructured
+volume rendering" (Callahan et al.), doi:10.1109/VISUAL.2004.85 (Kraus et al.)
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 
 Between its control points a transfer function is linear, outside them constant. Two control points
 at one position are a jump: below it the first counts, at it and above it the second. Emission
-follows the density emitter of Williams and Max ("A volume density optical model", 1992,
-doi:10.1145/147130.147151): along a ray dI = extinction(s) * color(s) * exp(-optical depth) dl, with
-extinction per unit of length.
+follows the density emitter of Williams and Max ("A volume density optical model", 1992): along a
+ray dI = extinction(s) * color(s) * exp(-optical depth) dl, with extinction per unit of length.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
 Two cells that share a face are in order: the one on the eye's side of the face comes first. Cells
 sorted topologically by these relations are in visibility order if the mesh is convex and has no
-cycles (MPVO: Williams, "Visibility ordering meshed polyhedra", 1992, doi:10.1145/130826.130899).
+cycles (MPVO: Williams, "Visibility ordering meshed polyhedra", 1992).
 Where a mesh is not convex, a ray leaves it and enters it again, and then the cell of the exit comes
-before that of the entry (SXMPVO: Cook, Max, Silva and Williams 2004, doi:10.1109/TVCG.2004.45; see
-`order.gaps`).
+before that of the entry (SXMPVO: Cook, Max, Silva and Williams, "Image-space visibility ordering
+for cell projection volume rendering of unstructured data", 2004; see `order.gaps`).
 
 Here
 

@@ -1,6 +1,6 @@
 """Hardware-assisted visibility sorting (Callahan, Ikits, Comba and Silva 2005), as a scan.
 
-doi:10.1109/TVCG.2005.46
+IEEE Transactions on Visualization and Computer Graphics, May/June 2005
 
 Faces are rasterised in an order that is nearly right (`jaxvr.order`, `trace.stream`), and each
 pixel puts its fragments right in a buffer of k entries. A fragment that arrives at a full buffer

@@ -1,6 +1,7 @@
 """Ray casting from cell to cell (Bunyk, Kaufman and Silva 1997; Espinha and Celes 2005).
 
-doi:10.1109/DAGSTUHL.1997.1423099, doi:10.1109/SIBGRAPI.2005.29
+"Simple, fast, and robust ray casting of irregular grids", Scientific Visualization Conference,
+Dagstuhl 1997, 30-36; doi:10.1109/SIBGRAPI.2005.29
 
 A ray inside a tetrahedron has come in through the face (a, b, c), whose vertices are listed in the
 order of the mesh, and sees the fourth vertex d. The signs of the three edges that d makes with a,

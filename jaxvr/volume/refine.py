@@ -1,7 +1,7 @@
 """Refinement of degenerate cells, those that are large but thin.
 
 Paper: Callahan, Ikits, Comba and Silva, "Hardware-Assisted Visibility Sorting for Unstructured
-Volume Rendering" (2005, doi:10.1109/TVCG.2005.46), section 5. They find that such cells bring
+Volume Rendering" (2005), section 5. They find that such cells bring
 faces, sorted by their centroids, far out of visibility order, and propose to look for the cells
 that digress most from the Delaunay property (no point in the circumsphere) and to subdivide them
 into smaller and more symmetric ones. How far a cell digresses and how it is cut they leave open:

@@ -449,6 +449,16 @@ def test_the_experiment_on_faults_finds_none():
     assert "kills, checkpoints" in done.stdout and "fault" not in done.stdout
 
 
+def test_a_fit_that_is_killed_and_resumed_is_the_unbroken_one():
+    """In a process of its own, since it forks."""
+    command = [sys.executable, "-m", "experiments.fit_kills", "--kills", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = {what: int(n) for n, what in (line.split(None, 1) for line in done.stdout.splitlines())}
+    assert found["resumed, equal to the bit"] == 1 and found["killed, with steps"] >= 1
+    assert found["killed, with steps"] + found.get("killed, without a step", 0) == 2
+
+
 def test_a_relative_path_stays_where_the_fit_began(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     keeper = Keeper("rel.npz", 1, lambda n: {})
