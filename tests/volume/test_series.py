@@ -131,7 +131,7 @@ def test_pieces_and_blocks_whose_file_is_not_there(folder):
         read_mesh(folder / "a.vtm", "t")
 
 
-@pytest.mark.parametrize("name", ["b.vtu", "a.vtm", "a.pvtu", "a.vtk", "b.vtk"])
+@pytest.mark.parametrize("name", ["b.vtu", "a.vtm", "a.pvtu", "a.vtk", "b.vtk", "c.vtk"])
 @pytest.mark.parametrize("what", ["points", "cells"])
 def test_what_comes_out_is_compared_with_the_header(name, what, folder, monkeypatch):
     if name == "a.pvtu":
@@ -142,7 +142,14 @@ def test_what_comes_out_is_compared_with_the_header(name, what, folder, monkeypa
         old = "CELLS 1 5\n4 0 1 2 3\n"
         new = "CELLS 2 4\nOFFSETS vtktypeint64\n0 4\nCONNECTIVITY vtktypeint64\n0 1 2 3\n"
         text = text.format("3.0") + old if name == "a.vtk" else text.format("5.1") + new
-        text += "CELL_TYPES 1\n10\nPOINT_DATA 4\nSCALARS t float\nLOOKUP_TABLE default\n0 1 2 3\n"
+        text += "CELL_TYPES 1\n10\n"
+        if name == "c.vtk":
+            text = "# vtk DataFile Version 3.0\na\nASCII\nDATASET STRUCTURED_POINTS\n"
+            text += "DIMENSIONS 2 2 2\nORIGIN 0 0 0\nSPACING 1 1 1\n"
+        values = " ".join(map(str, range(8 if name == "c.vtk" else 4)))
+        text += (
+            f"POINT_DATA {len(values.split())}\nSCALARS t float\nLOOKUP_TABLE default\n{values}\n"
+        )
         (folder / name).write_text(text)
     run_here(monkeypatch)
     assert read_mesh(folder / name, "t").n_tets
@@ -155,6 +162,106 @@ def test_what_comes_out_is_compared_with_the_header(name, what, folder, monkeypa
     monkeypatch.setattr(sizes, "claims", more)
     with pytest.raises(ValueError, match=rf"it has \d+ {what}, of which \w+ reads \d+"):
         read_mesh(folder / name, "t")
+
+
+def written(path, data):
+    """A file by VTK's own writer."""
+    kinds = {
+        ".vti": "ImageData", ".vtr": "RectilinearGrid", ".vts": "StructuredGrid",
+        ".pvti": "PImageData", ".pvtr": "PRectilinearGrid", ".pvts": "PStructuredGrid",
+        ".vtpd": "PartitionedDataSet", ".vtpc": "PartitionedDataSetCollection",
+    }  # fmt: skip
+    parallel = path.suffix.startswith(".p")
+    plain = path.suffix in (".vti", ".vtr", ".vts")
+    module = importlib.import_module(f"vtkmodules.vtkIO{'' if plain else 'Parallel'}XML")
+    writer = getattr(module, f"vtkXML{kinds[path.suffix]}Writer")()
+    writer.SetFileName(str(path))
+    writer.SetInputData(data)
+    writer.SetDataModeToAscii()
+    if parallel:
+        writer.SetNumberOfPieces(1)
+    assert writer.Write()
+    return path
+
+
+def structured(suffix):
+    """Of 4 x 3 x 2 points, and what VTK's files of this suffix hold."""
+    from vtkmodules.vtkCommonDataModel import vtkPartitionedDataSet, vtkPartitionedDataSetCollection
+
+    image = pyvista.ImageData(dimensions=(4, 3, 2))
+    image.point_data["t"] = np.arange(24.0)
+    if suffix in (".vtpd", ".vtpc"):
+        parts = vtkPartitionedDataSet()
+        parts.SetPartition(0, image)
+        parts.SetPartition(1, image.cast_to_structured_grid().translate((5, 0, 0)))
+        if suffix == ".vtpd":
+            return parts
+        parts_of_parts = vtkPartitionedDataSetCollection()
+        parts_of_parts.SetPartitionedDataSet(0, parts)
+        return parts_of_parts
+    return {
+        "i": lambda: image, "r": image.cast_to_rectilinear_grid, "s": image.cast_to_structured_grid
+    }[suffix[-1]]()  # fmt: skip
+
+
+STRUCTURED = (".vti", ".vtr", ".vts", ".pvti", ".pvtr", ".pvts")
+
+
+@pytest.mark.parametrize("suffix", [*STRUCTURED, ".vtpd", ".vtpc"])
+def test_structured_grids_are_compared_with_their_extents(suffix, tmp_path, monkeypatch):
+    run_here(monkeypatch)
+    path = written(tmp_path / f"a{suffix}", structured(suffix))
+    n = 1 if suffix in STRUCTURED else 2
+    claims = sizes.claims
+    assert claims(path, suffix) == {"points": 24 * n, "cells": 6 * n}
+    assert read_mesh(path, "t").n_tets == 36 * n
+    for what in ("points", "cells"):
+        monkeypatch.setattr(sizes, "claims", lambda *a, w=what: {w: claims(*a)[w] + 1})
+        with pytest.raises(ValueError, match=rf"it has \d+ {what}, of which \w+ reads \d+"):
+            read_mesh(path, "t")
+
+
+@pytest.mark.parametrize("suffix", STRUCTURED)
+def test_pieces_that_do_not_cover_the_whole(suffix, tmp_path):
+    """VTK gives what it finds in the memory for what is in none of them."""
+    path = written(tmp_path / f"a{suffix}", structured(suffix))
+    assert read_mesh(path, "t").n_tets == 36
+    text = path.read_text()
+    assert text.count('WholeExtent="0 3 0 2 0 1"') == 1
+    path.write_text(text.replace('WholeExtent="0 3 0 2 0 1"', 'WholeExtent="0 4 0 2 0 1"'))
+    with pytest.raises(ValueError, match=rf"a\{suffix} has 8 cells, of which pieces hold 6"):
+        read_mesh(path, "t")
+    if suffix.startswith(".p"):
+        path.write_text(text)
+        (tmp_path / f"a_0.{suffix[2:]}").unlink()
+        with pytest.raises(ValueError, match="it names 'a_0.*', which is not there"):
+            read_mesh(path, "t")
+
+
+def test_cells_that_pieces_cover():
+    rng = np.random.default_rng(0)
+    counts = set()
+    for k in range(200):
+        last = rng.integers(0 if k % 3 == 0 else 1, 5, 3)
+        whole = tuple(np.stack([[0, 0, 0], last], 1).ravel().tolist())
+        hit = np.zeros(np.maximum(last, 1), bool)
+        pieces = []
+        for _ in range(rng.integers(0, 5)):
+            ends = np.sort(rng.integers(0, last + 1, (2, 3)), axis=0)
+            pieces.append(tuple(ends.T.ravel().tolist()))
+            box = (slice(a, b + (m == 0)) for a, b, m in zip(*ends, last, strict=True))
+            hit[tuple(box)] = True
+        assert sizes._covered(whole, pieces) == hit.sum()
+        counts.add(int(hit.sum()))
+    assert len(counts) > 10
+
+
+def test_counts_of_all_blocks_are_compared_when_some_are_read(folder, monkeypatch):
+    run_here(monkeypatch)
+    assert read_mesh(folder / "a.vtm", "t", block="left").n_tets == 6
+    monkeypatch.setattr(sizes, "claims", lambda *_: {"points": 24, "cells": 2})
+    with pytest.raises(ValueError, match="it has 24 points, of which .* reads 16"):
+        read_mesh(folder / "a.vtm", "t", block="left")
 
 
 def test_ghosts_are_left_out_and_counted(tmp_path):

@@ -8,6 +8,7 @@ take (`memory`).
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from pathlib import Path
@@ -28,7 +29,10 @@ _RATIO = {
 _PARTS = {".pvd", ".series", ".pvtu", ".pvti", ".pvtr", ".pvts", ".vtm", ".vtmb", ".vtpd", ".vtpc",
           ".case", ".encas", ".xdmf", ".xmf", ".foam"}  # fmt: skip
 Counts = dict[str, int]
-COUNTED = (".vtu", ".vtk", ".pvtu", ".vtm")  # whose headers tell what has to come out
+_STRUCTURED = (".vti", ".vtr", ".vts")
+_LISTS = (".pvtu", ".vtm", ".vtmb", ".vtpd", ".vtpc")
+# Boxes that pieces cut the whole into, of which each is looked at.
+_MOST_BOXES = 10**7
 
 
 def volume_of(path: Path, suffix: str) -> int:
@@ -58,15 +62,19 @@ def seconds(size: int) -> float:
 
 
 def claims(path: Path, suffix: str) -> Counts:
-    """Points and cells that a file says it has, where that is cheap to tell. Raises Trouble where
-    they cannot be in a file of its size."""
+    """Points and cells that a file says it has, where that is cheap to tell: for all of VTK's XML
+    kinds and its legacy files, and for UGRID. Not for those whose counts are in HDF5 (VTKHDF, CGNS)
+    or spread over files that begin in several ways (EnSight). Raises Trouble where they cannot be
+    in a file of its size, and where pieces are missing."""
     size = path.stat().st_size
     if suffix == ".vtu":
         return _vtu(path, size)
     if suffix == ".vtk":
         return _legacy(path, size)
-    if suffix in (".pvtu", ".vtm"):
+    if suffix in _LISTS:
         return _listed(path, suffix)
+    if suffix in _STRUCTURED or suffix in (".pvti", ".pvtr", ".pvts"):
+        return _structured(path, suffix)
     if suffix == ".ugrid":
         return _ugrid(path, size)
     return {}
@@ -106,22 +114,101 @@ def _vtu(path: Path, size: int) -> Counts:
 
 
 def _listed(path: Path, suffix: str) -> Counts:
-    """The sum over the .vtu files that a file lists; nothing where there are others among them."""
+    """The sum over the files that a file lists; nothing where some of them do not tell."""
     tag, key = ("Piece", "Source") if suffix == ".pvtu" else ("DataSet", "file")
     try:
         entries = ElementTree.fromstring(path.read_bytes()).iter(tag)
         files = [path.parent / e.attrib[key] for e in entries if e.get(key)]
     except ElementTree.ParseError:
         return {}  # its reader says what is wrong
-    if any(file.suffix != ".vtu" for file in files):
+    if any(file.suffix not in (".vtu", *_STRUCTURED) for file in files):
         return {}
     found: Counts = {"points": 0, "cells": 0}
     for file in files:
-        if not file.is_file():
-            raise Trouble("damaged", f"it names {file.name!r}, which is not there")
-        for what, n in _vtu(file, file.stat().st_size).items():
+        _require_there(file)
+        for what, n in claims(file, file.suffix).items():
             found[what] += n
     return found
+
+
+def _require_there(file: Path) -> None:
+    if not file.is_file():
+        raise Trouble("damaged", f"it names {file.name!r}, which is not there")
+
+
+Extent = tuple[int, int, int, int, int, int]
+
+
+def _extents(path: Path) -> tuple[Extent | None, list[Extent], list[str]]:
+    """The whole extent of a structured grid, those of its pieces, and the files that these name."""
+    with open(path, "rb") as f:
+        text = f.read()
+
+    def numbers(key: bytes, tag: bytes) -> list[Extent]:
+        found = re.search(rb"\b" + key + rb"""\s*=\s*["']([-\s\d]*)["']""", tag)
+        words = found[1].split() if found else []
+        try:
+            return [tuple(int(w) for w in words)] if len(words) == 6 else []  # type: ignore[list-item]
+        except ValueError:
+            return []
+
+    whole = numbers(b"WholeExtent", text)
+    pieces: list[Extent] = []
+    sources = []
+    for tag in re.findall(rb"<Piece\b[^>]*>", text):
+        pieces += numbers(b"Extent", tag)
+        if source := re.search(rb"""\bSource\s*=\s*["']([^"']*)["']""", tag):
+            sources.append(source[1].decode("utf-8", "replace"))
+    return (whole[0] if whole else None), pieces, sources
+
+
+def _structured(path: Path, suffix: str) -> Counts:
+    """By the whole extent, which pieces have to cover: VTK leaves what it finds in the memory where
+    they do not."""
+    whole, pieces, sources = _extents(path)
+    if whole is None:
+        return {}  # its reader says what is wrong
+    if suffix.startswith(".p"):
+        pieces = []
+        for source in sources:
+            _require_there(path.parent / source)
+            pieces += _extents(path.parent / source)[1]
+    sizes = [high - low + 1 for low, high in zip(whole[::2], whole[1::2], strict=True)]
+    if min(sizes) < 1:
+        return {"points": 0, "cells": 0}
+    cells = math.prod(max(n - 1, 1) for n in sizes)
+    covered = _covered(whole, pieces)
+    if covered < cells:
+        raise Trouble("damaged", f"{path.name} has {cells} cells, of which pieces hold {covered}")
+    return {"points": math.prod(sizes), "cells": cells}
+
+
+def _covered(whole: Extent, pieces: list[Extent]) -> int:
+    """How many cells of the whole are in some piece."""
+    flat = [low == high for low, high in zip(whole[::2], whole[1::2], strict=True)]
+
+    def sides(extent: Extent) -> list[tuple[int, int]]:
+        """From the first cell of the whole to behind the last one, along each axis."""
+        pairs = zip(extent[::2], extent[1::2], whole[::2], whole[1::2], flat, strict=True)
+        return [
+            (max(low, first), min(high, last) + (1 if one and low <= high else 0))
+            for low, high, first, last, one in pairs
+        ]
+
+    boxes = [box for box in map(sides, pieces) if all(low < high for low, high in box)]
+    volumes = [math.prod(high - low for low, high in box) for box in boxes]
+    planes = [sorted({x for box in boxes for x in box[axis]}) for axis in range(3)]
+    if math.prod(map(len, planes)) > _MOST_BOXES:
+        return sum(volumes)  # at least so many as there are
+    import numpy as np
+
+    hit = np.zeros([max(len(p) - 1, 0) for p in planes], bool)
+    for box in boxes:
+        hit[tuple(slice(p.index(low), p.index(high)) for p, (low, high) in zip(planes, box))] = True
+    each = [np.diff(np.array(p, object)) for p in planes]
+    return sum(
+        int(each[0][i]) * int(each[1][j]) * int(each[2][k]) for i, j, k in np.argwhere(hit).tolist()
+    )
 
 
 def _legacy(path: Path, size: int) -> Counts:
@@ -141,6 +228,9 @@ def _legacy(path: Path, size: int) -> Counts:
         _bound(int(m[2]), "numbers of cells", 2, size)
         _bound(int(m[1]), "cells", 2, size)
         found["cells"] = int(m[1]) - (1 if new else 0)  # version 5 counts offsets
+    dims = re.search(rb"^DIMENSIONS\s+(\d+)\s+(\d+)\s+(\d+)\s", text[:2000], re.M | re.I)
+    if dims and all(n := [int(x) for x in dims.groups()]):
+        found = {"points": math.prod(n), "cells": math.prod(max(x - 1, 1) for x in n)}
     m = re.search(rb"^(?:POINT|CELL)_DATA\s+(\d+)", text, re.M | re.I)
     if m and not re.search(rb"^FIELD\s", text[m.end() :], re.M | re.I):
         _bound(int(m[1]), "values", 1, size)

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from . import sizes
 from .content import Ask, Content, Trouble, pick_step
 from .vtk_data import content_of
 
@@ -102,8 +101,7 @@ def read(path: Path, ask: Ask, said: Callable[[], str], suffix: str) -> Content:
         raise Trouble("damaged", f"{name}: {_plain(told[found.start() :])}")
     content = content_of(data, ask.block, ask.limit, path.name)
     content.reader = name
-    if suffix in sizes.COUNTED and ask.block is None:
-        content.raw = data.GetNumberOfPoints(), data.GetNumberOfCells()
+    content.raw = data.GetNumberOfPoints(), data.GetNumberOfCells()  # of all blocks
     content.steps = steps if len(steps) > 1 else ()
     content.step = step
     if suffix == ".vtk":
