@@ -23,6 +23,7 @@ from jaxvr._core.warn import warn
 from jaxvr.adjoint import AbstractAdjoint, Replay
 from jaxvr.composite import Over
 from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
+from jaxvr.optics.transfer import tell_coarse
 from jaxvr.trace import AbstractTracer, RayCast, Segments
 from jaxvr.trace.integrity import require_segments
 from jaxvr.view.camera import Camera
@@ -91,7 +92,15 @@ def transfer_of(transfer: Any, volume: Any) -> TransferFunction:
     transfer = TransferFunction(
         transfer.positions, transfer.colors, transfer.extinctions, offset=transfer.offset
     )
+    require_positions(transfer, volume)
     return transfer.relative_to(volume.offset, dtype_of(volume))
+
+
+def require_positions(transfer: TransferFunction, volume: Any) -> None:
+    """Warns of positions that have no offset, and too few digits, beside a mesh or segments that
+    have one: they came out of `jit`, or were passed in float32 with offset=0."""
+    if volume.offset and not transfer.offset:
+        tell_coarse(transfer.positions)
 
 
 def segments_of(segments: Any) -> Segments:

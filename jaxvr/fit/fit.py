@@ -28,6 +28,7 @@ from jaxvr.arguments import (
     background_of,
     compositor_of,
     integrator_of,
+    require_positions,
     tracer_of,
     volume_of,
 )
@@ -151,6 +152,7 @@ def fit(
     every = gather_views(
         volume, cameras, targets, cache=cache, tracer=tracer, background=background
     )
+    require_positions(transfer, cameras[0] if volume is None else volume)
     seen, unseen = every.parted(number_seen)
     dtype = seen.targets.dtype
     # A length to measure extinctions by, where the start has none.

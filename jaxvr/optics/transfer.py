@@ -95,8 +95,8 @@ class TransferFunction:
         require_finite("extinctions", extinctions)
         _require_sorted(positions)
         _require_nonnegative(extinctions)
-        if not told:  # else they are relative to it
-            _tell_coarse(given)
+        if told is None:  # else they are relative to it, or meant to be as they are
+            tell_coarse(given)
         _set(self, jnp.asarray(positions), jnp.asarray(colors), jnp.asarray(extinctions), offset)
 
     # JAX's register_dataclass would run `__init__`, and its checks, at every unflatten.
@@ -146,8 +146,8 @@ class TransferFunction:
         positions = np.asarray(as_floats("positions", positions, ndim=1, dtype=np.float64))
         require_finite("positions", positions)
         _require_sorted(positions)
-        if not offset:
-            _tell_coarse(given)  # the constructor sees float64
+        if offset is None:
+            tell_coarse(given)  # the constructor sees float64
         if not isinstance(colormap, str) and not callable(colormap):
             _require_unit_colors("The colour table", colormap)
         colors = colormaps.sample(colormap, _span(positions), srgb=srgb)
@@ -258,8 +258,7 @@ class TransferFunction:
         positions = as_floats("positions", positions, ndim=1, dtype=self.dtype)
         require_finite("positions", positions)
         _require_sorted(positions)
-        if self.offset:  # without one the constructor tells
-            _tell_coarse(given)
+        tell_coarse(given)
         if positions.shape[0] == 0:
             raise ValueError("resample needs at least one position, but got none.")
         return self._resampled(jnp.asarray(positions))
@@ -471,7 +470,7 @@ def _less_offset(positions: Any, offset: Any, dtype: Any) -> tuple[Any, float]:
     return held, away
 
 
-def _tell_coarse(positions: Any) -> None:
+def tell_coarse(positions: Any) -> None:
     """Warns of digits that sorted positions, as they came, had lost before."""
     if said := coarse(positions):
         warn(f"positions {said}", UserWarning)
