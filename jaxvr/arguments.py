@@ -18,7 +18,7 @@ from jaxvr._core.checks import (
     require_finite,
     require_kind,
 )
-from jaxvr._core.offsets import FAR, Origin, relative, said
+from jaxvr._core.offsets import FAR, Origin, is_single, relative, said
 from jaxvr._core.warn import warn
 from jaxvr.adjoint import AbstractAdjoint, Replay
 from jaxvr.composite import Over
@@ -147,14 +147,14 @@ def rays_of(origins: Any, directions: Any, volume: Any) -> tuple[Array, Array]:
     """Origins and directions of one shape (..., 3), the latter not zero; the former relative to the
     volume's origin."""
     dtype = dtype_of(volume)
+    if any(volume.origin) and is_single(origins):
+        step = np.spacing(np.float32(np.abs(volume.origin).max()))
+        warn(
+            f"origins are float32, with steps of {step:.2g} beside a volume at "
+            f"{said(volume.origin)}. Pass float64.",
+            UserWarning,
+        )
     if isinstance(origins, jax.Array):
-        if any(volume.origin) and origins.dtype == np.float32:
-            step = np.spacing(np.float32(np.abs(volume.origin).max()))
-            warn(
-                f"origins are JAX's float32, with steps of {step:.2g} beside a volume at "
-                f"{said(volume.origin)}. Pass NumPy's float64.",
-                UserWarning,
-            )
         origins = as_floats("origins", origins)
     else:
         origins = as_floats("origins", origins, dtype=np.float64)

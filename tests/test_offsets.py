@@ -150,7 +150,7 @@ def test_numbers_that_no_cell_uses_do_not_count():
     with pytest.warns(UserWarning, match="inverted"):
         mesh = TetMesh.from_cells(points, CELLS, values, dtype="float32")
     assert mesh.offset and all(mesh.origin)
-    assert mesh.replace(values=values, offset=0).offset == 0
+    assert mesh.replace(values=values, offset=0).offset == mesh.offset
     assert BOX.replace(values=FIELD + 1e6).offset == 0  # float64
     again = jaxvr.datasets.box((3, 3, 2), 0.2, dtype="float32").replace(values=FIELD + 1e6)
     assert np.abs(again.absolute_values() - FIELD - 1e6).max() < 1e-6
@@ -322,7 +322,7 @@ def test_cameras_and_rays_that_lost_their_digits_are_told(both):
     with pytest.warns(UserWarning, match="with steps of 0.5 beside a volume at"):
         lost = Camera.look_at(jnp.asarray(eye, jnp.float32), jnp.asarray(target, jnp.float32))
         jaxvr.render(both.mesh, lost.replace(width=4, height=4), both.transfer)
-    with pytest.warns(UserWarning, match="origins are JAX's float32, with steps of 0.5"):
+    with pytest.warns(UserWarning, match="origins are float32, with steps of 0.5"):
         jaxvr.render_rays(
             both.mesh, jnp.asarray(eye, jnp.float32), jnp.ones(3, jnp.float32), both.transfer
         )

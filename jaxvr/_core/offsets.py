@@ -35,6 +35,9 @@ NOWHERE: Origin = (0.0, 0.0, 0.0)
 # rendering in float32 else keeps: see "Numbers far from 0" in notebooks/accuracy.md.
 FAR = 32.0
 
+# What steps of float32 may be as a part of what they are to tell apart.
+COARSE = 1e-3
+
 
 def offset_between(low: float, high: float, dtype: Any, width: float | None = None) -> float:
     """What to take off numbers from `low` to `high`: one near their middle, or 0.0 where `dtype`
@@ -53,6 +56,39 @@ def origin_between(low: np.ndarray, high: np.ndarray, dtype: Any) -> Origin:
     return x, y, z
 
 
+def added(said: Any, more: Any) -> tuple[Any, Any]:
+    """An offset, or an origin, for numbers that are relative to `said`, from which `more` is to be
+    taken: their sum, and what that takes of the numbers, to the last bit."""
+    total = np.asarray(said, np.float64) + np.asarray(more, np.float64)
+    whole = origin_of(total) if total.ndim else float(total)
+    return whole, total - np.asarray(said, np.float64)
+
+
+def is_single(x: Any) -> bool:
+    """Whether numbers come in floats of less than 64 bits: what float32 loses is lost already."""
+    dtype = getattr(x, "dtype", None)
+    return dtype is not None and jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize < 8
+
+
+def digits_of(x: Any) -> Any:
+    """JAX's known arrays of more digits than float32 has as NumPy's, since an offset is taken off
+    of these; anything else as it is."""
+    if isinstance(x, jax.Array) and is_concrete(x) and not is_single(x):
+        return np.asarray(x)
+    return x
+
+
+def coarse_step(x: Any, width: float) -> float | None:
+    """The step of float32 among known numbers that came in it, if it is more than a thousandth of
+    `width`; else None. Of multiples of sixteen steps none was rounded (whole numbers, say)."""
+    if not is_single(x) or not is_concrete(x) or not np.size(x) or not 0 < width < math.inf:
+        return None
+    numbers = np.asarray(x, np.float32)
+    step = float(np.spacing(np.abs(numbers).max()))
+    rounded = step > COARSE * width and np.fmod(numbers, np.float32(16 * step)).any()
+    return step if rounded else None
+
+
 def bare(x: Any) -> Any:
     """What is held relative to an offset without it. Compiled functions need not know of it: for
     another one they are not compiled again."""
@@ -65,7 +101,10 @@ def bare(x: Any) -> Any:
 
 def bulk(x: np.ndarray) -> tuple[float, float]:
     """Where most of the numbers (n,) lie: from 1 to 99 % of them, or all where that is one."""
-    few = x if len(x) < 1 << 16 else x[:: len(x) >> 15]
+    few = x
+    if len(x) >= 1 << 16:
+        # A prime's multiples, whose steps go with those of no grid.
+        few = x[np.arange(1 << 15, dtype=np.int64) * 2654435761 % len(x)]
     low, high = (float(v) for v in np.quantile(few, (0.01, 0.99)))
     return (low, high) if high > low else (float(x.min()), float(x.max()))
 

@@ -77,5 +77,5 @@ def _view(camera: Any, dtype: Any) -> Any:
     if isinstance(camera, Segments):
         used = int(np.asarray(camera.start)[-1])
         nodes = camera.scalar[:used], camera.length[:used]
-        return nodes, camera.start, camera.order, camera.shape
+        return nodes, camera.start, camera.order, camera.shape, camera.offset
     return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), camera)

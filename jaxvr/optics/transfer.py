@@ -27,7 +27,11 @@ from jaxvr._core.checks import (
 )
 from jaxvr._core.offsets import (
     absolute,
+    added,
     coarse,
+    coarse_step,
+    digits_of,
+    is_single,
     moved,
     offset_between,
     offset_of,
@@ -55,14 +59,15 @@ class TransferFunction:
 
     offset:           what the positions are relative to; no leaf, but part of the tree's structure.
         0 but for scalars far from 0 and close together, of which float32 would keep too few digits
-        (101325 to 101325.01): passed as plain numbers or NumPy's float64, they have one taken off.
+        (101325 to 101325.01): passed as plain numbers or in float64, they have one taken off.
         `absolute_positions` puts it back. Passing `offset` says that positions are relative to it.
+        Positions of JAX's float32, and traced ones, are held as they are.
 
     The three share one dtype: that of the arrays passed, JAX's default float for plain numbers, or
     `dtype`. Calling the class checks everything; under `jit` and `grad`, where values are not
     known, it checks the shapes. Rebuilding from leaves (`jax.tree`) checks nothing, so gradients
     and other trees of the same structure are TransferFunctions too. Warns where float32 makes two
-    positions one.
+    positions one, or changes the distance between them by more than a sixteenth.
     """
 
     positions: Array
@@ -151,15 +156,13 @@ class TransferFunction:
         if not isinstance(colormap, str) and not callable(colormap):
             _require_unit_colors("The colour table", colormap)
         colors = colormaps.sample(colormap, _span(positions), srgb=srgb)
-        tf = TransferFunction(
-            positions, colors.astype(dtype), extinctions, offset=offset, dtype=dtype
-        )
+        tf = TransferFunction(given, colors.astype(dtype), extinctions, offset=offset, dtype=dtype)
         if points is None:
             return tf
         if points < 1:
             raise ValueError(f"points must be at least 1, but is {points}.")
         own = np.asarray(tf.positions)
-        away = tf.offset if offset is None else 0.0  # positions are as they are, or relative
+        away = tf.offset - (offset or 0.0)
         extra = (np.linspace(positions[0], positions[-1], points) - away).astype(dtype)
         extra = extra[~np.isin(extra, own)]
         merged = np.sort(np.concatenate([own, extra]))
@@ -242,9 +245,22 @@ class TransferFunction:
 
     def _evaluate(self, scalars: Any, side: str) -> tuple[Array, Array]:
         if self.offset:
+            self._tell_coarse(scalars)
             scalars = relative(scalars, self.offset, self.dtype)
         s = jnp.asarray(scalars)
         return _evaluate(self, s.astype(jnp.promote_types(s.dtype, self.dtype)), side)
+
+    def _tell_coarse(self, scalars: Any) -> None:
+        """Warns of scalars in float32 beside positions that are held relative to an offset."""
+        if not is_concrete(self.positions) or not is_single(scalars) or self.positions.ndim != 1:
+            return
+        width = float(self.positions[-1]) - float(self.positions[0])
+        if step := coarse_step(scalars, width):
+            warn(
+                f"scalars come in float32, which has steps of {step:.2g} there, for positions over "
+                f"{width:.3g}. What was lost is not to be had back: pass NumPy's float64.",
+                UserWarning,
+            )
 
     def resample(self, positions: Any) -> TransferFunction:
         """This function at other control points (M,); the same function if they include all of K.
@@ -324,10 +340,15 @@ class TransferFunction:
     def relative_to(self, offset: float, dtype: Any = None) -> TransferFunction:
         """The same function with its positions relative to another offset. Differentiable.
 
-        dtype: as for `Camera.relative_to`.
+        dtype: as for `Camera.relative_to`. Warns where float32 makes two positions one there, or
+        changes the distance between them by more than a sixteenth.
         """
-        offset, dtype = offset_of(offset), self.dtype if dtype is None else dtype
+        offset, dtype = offset_of(offset), self.dtype if dtype is None else np.dtype(dtype)
         positions = moved(self.positions, self.offset, offset, dtype)
+        changed = offset != self.offset or dtype.itemsize < self.dtype.itemsize
+        if changed and positions.ndim == 1 and is_concrete(positions):
+            before, after = self.absolute_positions(), absolute(positions, offset)
+            _tell_moved(before, after, dtype)
         others = (jnp.asarray(x).astype(dtype) for x in (self.colors, self.extinctions))
         return TransferFunction.tree_unflatten(offset, (positions, *others))
 
@@ -449,25 +470,24 @@ def _evaluate(tf: TransferFunction, s: Array, side: str) -> tuple[Array, Array]:
     return colors, below_e + t * (tf.extinctions[hi] - below_e)
 
 
+# What rounding may change of the distance of two positions, as a part of it.
+_MOVED = 1 / 16
+
+
 def _less_offset(positions: Any, offset: Any, dtype: Any) -> tuple[Any, float]:
     """Positions (K,) in `dtype` and what they are relative to. See `TransferFunction`."""
-    if offset is not None:
-        return as_floats("positions", positions, ndim=1, dtype=dtype), offset_of(offset)
+    said = 0.0 if offset is None else offset_of(offset)
     given = _wide("positions", positions)
-    if isinstance(given, jax.Array) or given.ndim != 1 or len(given) == 0:
-        return as_floats("positions", given, ndim=1, dtype=dtype), 0.0
+    as_it_is = isinstance(given, jax.Array) or (is_single(positions) and offset is not None)
+    if as_it_is or given.ndim != 1 or len(given) == 0:
+        return as_floats("positions", given, ndim=1, dtype=dtype), said
     ends = float(given[0]), float(given[-1])
     away = offset_between(*ends, dtype) if np.isfinite(ends).all() else 0.0
+    total, away = added(said, away)
     with np.errstate(over="ignore"):  # infinite, and found by whoever checks
         held = (given - away).astype(dtype)
-    if len(merged := np.flatnonzero((held[1:] == held[:-1]) & (given[1:] > given[:-1]))):
-        k = int(merged[0])
-        warn(
-            f"{len(merged)} pairs of positions are one in {np.dtype(dtype)}, and make a jump: the "
-            f"first are positions[{k}] = {given[k]:.17g} and [{k + 1}] = {given[k + 1]:.17g}.",
-            UserWarning,
-        )
-    return held, away
+    _tell_moved(given, held.astype(np.float64) + away, dtype)
+    return held, total
 
 
 def tell_coarse(positions: Any) -> None:
@@ -477,8 +497,31 @@ def tell_coarse(positions: Any) -> None:
 
 
 def _wide(name: str, x: Any) -> Any:
-    """Floats as they come: float64 for what is not JAX's."""
+    """Floats as they come: NumPy's float64 but for JAX's float32 and what is traced."""
+    x = digits_of(x)
     return x if isinstance(x, jax.Array) else as_floats(name, x, dtype=np.float64)
+
+
+def _tell_moved(given: np.ndarray, held: np.ndarray, dtype: Any) -> None:
+    """Warns of positions (K,), float64, that are others as they are held, beside how far they are
+    from each other."""
+    with np.errstate(invalid="ignore"):  # what overflows is found by whoever checks
+        apart, error = np.diff(given), np.abs(np.diff(held - given))
+    merged = np.flatnonzero((held[1:] == held[:-1]) & (apart > 0))
+    shifted = np.flatnonzero((error > apart * _MOVED) & (apart > 0))
+    for found, what in (
+        (merged, f"are one in {np.dtype(dtype)}, and make a jump"),
+        (shifted, f"are no longer as far from each other in {np.dtype(dtype)}"),
+    ):
+        if len(found):
+            k = int(found[0])
+            warn(
+                f"{len(found)} pairs of positions {what}: the first are positions[{k}] = "
+                f"{given[k]:.17g} and [{k + 1}] = {given[k + 1]:.17g}. Numbers far from each other "
+                "need float64.",
+                UserWarning,
+            )
+            return
 
 
 def _set(tf: TransferFunction, positions: Any, colors: Any, extinctions: Any, offset: Any) -> None:

@@ -188,6 +188,10 @@ def _own(document: dict[str, Any], dtype: Any) -> TransferFunction:
     if offset is not None and offset.ndim:
         raise ValueError(f"'offset' must be one number, but is {document['offset']!r}.")
     away = None if offset is None else float(offset)
+    held = arrays[0].astype(stored)
+    if stored == "float32" and np.array_equal(held, arrays[0]):
+        # As `write` has them: they are to be the same bits, relative to the same offset.
+        arrays[0], away = held, away or 0.0
     return _transfer_class()(*arrays, offset=away, dtype=stored if dtype is None else dtype)
 
 

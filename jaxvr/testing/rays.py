@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -138,10 +139,14 @@ def scaled(
     one = np.asarray(mesh.points).dtype.type
     scale = [np.ldexp(one(1), k) for k in (scalar, length, extinction)]
     moved = mesh.replace(
-        values=np.asarray(mesh.values) * scale[0], points=np.asarray(mesh.points) * scale[1]
+        values=np.asarray(mesh.values) * scale[0],
+        points=np.asarray(mesh.points) * scale[1],
+        origin=[math.ldexp(x, length) for x in mesh.origin],
+        offset=math.ldexp(mesh.offset, scalar),
     )
     return moved, TransferFunction(
         np.asarray(transfer.positions) * scale[0],
         np.asarray(transfer.colors),
         np.asarray(transfer.extinctions) * scale[2],
+        offset=math.ldexp(transfer.offset, scalar),
     )

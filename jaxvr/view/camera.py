@@ -34,6 +34,10 @@ from jaxvr._core.offsets import (
     NOWHERE,
     Origin,
     absolute,
+    added,
+    coarse_step,
+    digits_of,
+    is_single,
     offset_between,
     origin_of,
     require_said,
@@ -43,6 +47,7 @@ from jaxvr._core.offsets import moved as moved_to
 from jaxvr._core.pytree import pytree, static
 from jaxvr._core.stage import stage
 from jaxvr._core.units import near_one
+from jaxvr._core.warn import warn
 
 Array = jax.Array
 
@@ -67,8 +72,9 @@ class Camera:
     extent ():    full vertical height in world units of an orthographic camera, else None.
     width, height: pixels; part of the tree's structure.
     origin (3,):  plain numbers, part of the structure. 0 but in float32 for a target that lies far
-        from 0 beside the eye's distance: given as plain numbers or NumPy's float64 the two have it
-        taken off before they are rounded. `orbit` takes that of the volume.
+        from 0 beside the eye's distance: given as plain numbers or in float64 the two have it
+        taken off before they are rounded. `orbit` takes that of the volume. JAX's float32, and what
+        is traced, is held as it is.
 
     The arrays share one dtype, which is that of the rays. The rays are differentiable in eye,
     target, up and fov or extent. The factories and `replace` check their arguments (values only
@@ -252,7 +258,7 @@ class Camera:
 
         Passing `fov` to an orthographic camera, or `extent` to a pinhole, turns it into the other
         kind. The dtype stays. eye and target are relative to `origin`; where the camera has one,
-        say `origin=` with them.
+        say `origin=` with them: 0 for the world, which keeps its digits as in `look_at`.
         """
         names = {f.name for f in dataclasses.fields(self)}
         if unknown := set(changes) - names:
@@ -269,8 +275,13 @@ class Camera:
             require_said(" and ".join(moved), "origin", self.origin)
             changes["origin"] = self.origin
         origin = origin_of(changes.get("origin", self.origin))
+        wide = any(not is_single(digits_of(changes[name])) for name in moved)
         for name in ("eye", "target"):
-            if name not in changes:
+            if name in changes or origin == self.origin and not wide:
+                continue
+            if wide and is_concrete(old[name]):
+                old[name] = absolute(old[name], self.origin) - origin
+            else:
                 old[name] = moved_to(old[name], self.origin, origin, self.dtype)
         new = old | changes | {"origin": origin}
         return _make(**new, dtype=self.dtype)
@@ -391,10 +402,9 @@ def _make(
     dtype: Any,
     origin: Origin | None = None,
 ) -> Camera:
-    """origin: what eye and target are relative to; None for the world, where they may get one."""
+    """origin: what eye and target are relative to; None for the world."""
     dtype = common_float(dtype, eye, target, up)
-    if origin is None:
-        eye, target, origin = _less_origin(eye, target, dtype)
+    eye, target, origin = _less_origin(eye, target, dtype, origin)
     eye, target, up = (_vector(*v, dtype) for v in (("eye", eye), ("target", target), ("up", up)))
     if fov is not None and extent is not None:
         raise ValueError("A camera has a fov (pinhole) or an extent (orthographic), not both.")
@@ -413,18 +423,34 @@ def _make(
     )
 
 
-def _less_origin(eye: Any, target: Any, dtype: Any) -> tuple[Any, Any, Origin]:
+def _less_origin(
+    eye: Any, target: Any, dtype: Any, said: Origin | None
+) -> tuple[Any, Any, Origin]:
     """Eye and target relative to an origin near the target, where they are far from 0 beside the
-    distance from one to the other, and are not JAX's."""
-    if isinstance(eye, jax.Array) or isinstance(target, jax.Array):
-        return eye, target, NOWHERE
-    wide = [as_floats(n, x, dtype=np.float64) for n, x in (("eye", eye), ("target", target))]
+    distance from one to the other, and known in more digits than those of JAX's float32."""
+    origin = NOWHERE if said is None else said
+    wide = digits_of(eye), digits_of(target)
+    if any(isinstance(x, jax.Array) for x in wide):
+        return eye, target, origin
+    wide = [as_floats(n, x, dtype=np.float64) for n, x in zip(("eye", "target"), wide, strict=True)]
     if any(x.shape != (3,) or not np.isfinite(x).all() for x in wide):
-        return eye, target, NOWHERE  # said by whoever checks
+        return eye, target, origin  # said by whoever checks
     far = float(np.abs(wide[1] - wide[0]).max())
-    x, y, z = (offset_between(float(t), float(t), dtype, far) for t in wide[1])
-    origin = (x, y, z)
-    return wide[0] - origin, wide[1] - origin, origin
+    away = np.asarray([offset_between(float(t), float(t), np.float32, far) for t in wide[1]])
+    single = [x for x in (eye, target) if is_single(x)]
+    if said is not None and len(single) == 2:
+        return eye, target, origin
+    for name, x in (("eye", eye), ("target", target)):
+        if away.any() and (step := coarse_step(x, far)):
+            warn(
+                f"{name} comes in float32, which has steps of {step:.2g} there, {far:.3g} from the "
+                "other of eye and target. What was lost is not to be had back: pass float64.",
+                UserWarning,
+            )
+    if np.dtype(dtype) != np.float32:
+        return eye, target, origin
+    origin, away = added(origin, away)
+    return wide[0] - away, wide[1] - away, origin
 
 
 def _vector(name: str, x: Any, dtype: Any) -> Any:

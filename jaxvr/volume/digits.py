@@ -11,11 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from .._core.offsets import bulk, offset_between
+from .._core.offsets import COARSE, FAR, bulk, coarse_step, is_single, offset_between
 
-# What float32 may move a point by, as a part of its cell's shortest edge, and a value by, as a part
-# of the range of most of them.
-_COARSE = 1e-3
 # The part of the different values that has to stay different. Of millions, so dense that it does
 # not matter, a tenth falls together.
 _KEPT = 0.75
@@ -33,7 +30,7 @@ def coarse_cells(
     given, exact, held (P, 3): points as they came; in float64, relative to the origin; and in the
     mesh's dtype. Of points that came in float32 far from 0 the rounding is that which they have.
     """
-    if origin.any() and _is_single(given):
+    if origin.any() and is_single(given):
         rounding = np.spacing(np.abs(np.asarray(given, np.float32))).max(axis=1) / 2
     elif held.dtype == np.float64:
         return 0
@@ -47,15 +44,15 @@ def coarse_cells(
         for j in range(i):
             size = np.abs(corners[:, i] - corners[:, j]).max(axis=1)
             shortest = np.minimum(shortest, size)
-    return int((rounding[cells].max(axis=1) > _COARSE * shortest).sum())
+    return int((rounding[cells].max(axis=1) > COARSE * shortest).sum())
 
 
 def lost_values(given: Any, numbers: np.ndarray, offset: float, dtype: np.dtype) -> str | None:
     """What to say of numbers (n,), float64 and as they are, of which too few digits are left."""
     low, high = bulk(numbers)
-    if _is_single(given):
-        step = float(np.spacing(np.float32(max(abs(low), abs(high)))))
-        if not offset_between(low, high, np.float32) or step <= _COARSE * (high - low):
+    if is_single(given):
+        step = coarse_step(np.asarray([low, high], np.float32), high - low)
+        if not offset_between(low, high, np.float32) or step is None:
             return None
         return (
             f"values come in float32, which has steps of {step:.2g} there: most of them lie from "
@@ -71,23 +68,23 @@ def lost_values(given: Any, numbers: np.ndarray, offset: float, dtype: np.dtype)
     distinct = np.ldexp(np.unique(np.round(np.ldexp(numbers, -unit))), unit)
     if len(distinct) > _MANY:
         return None
-    kept = len(np.unique((distinct - offset).astype(dtype)))
-    if kept > _KEPT * len(distinct):
-        return None
     small = largest < float(np.finfo(dtype).tiny)
     where, else_ = (
         ("are too near 0 for it", "scale them")
         if small
         else ("lie in places far from each other", "leave out what is far")
     )
-    return (
-        f"float32 keeps {kept} of the {len(distinct)} different values: they {where}, from "
-        f"{numbers.min():.9g} to {numbers.max():.9g}. Turn on x64 "
-        f'(jax.config.update("jax_enable_x64", True)) and pass dtype="float64", or {else_}.'
-    )
-
-
-def _is_single(x: Any) -> bool:
-    """Whether numbers come in less than float64 (whole numbers do not)."""
-    dtype = getattr(x, "dtype", None)
-    return dtype is not None and np.dtype(dtype).kind == "f" and np.dtype(dtype).itemsize < 8
+    # An offset for most of them takes digits from those that lie elsewhere, however few.
+    elsewhere = np.abs(distinct - offset) > FAR * (high - low)
+    for some, what in (
+        (distinct, "different"),
+        (distinct[elsewhere] if offset else distinct[:0], "different outlying"),
+    ):
+        kept = len(np.unique((some - offset).astype(dtype)))
+        if len(some) and kept <= _KEPT * len(some):
+            return (
+                f"float32 keeps {kept} of the {len(some)} {what} values: they {where}, from "
+                f"{numbers.min():.9g} to {numbers.max():.9g}. Turn on x64 "
+                f'(jax.config.update("jax_enable_x64", True)) and pass dtype="float64", or {else_}.'
+            )
+    return None

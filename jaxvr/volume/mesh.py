@@ -16,6 +16,9 @@ from .._core.offsets import (
     NOWHERE,
     Origin,
     absolute,
+    added,
+    digits_of,
+    is_single,
     offset_of,
     origin_between,
     origin_of,
@@ -24,12 +27,12 @@ from .._core.offsets import (
 )
 from .._core.pytree import pytree, static
 from .build import build, require_sound
-from .digits import lost_values
+from .digits import coarse_cells
 from .integrity import require_connectivity, trust, trust_entries
 from .mirror import mirrored
-from .report import MeshReport
+from .report import MeshReport, coarse_warning
 from .statistics import used_points
-from .values import choose_location, offset_for, place, rounded
+from .values import choose_location, less_offset, place
 
 Array = jax.Array
 
@@ -160,9 +163,10 @@ class TetMesh:
         location is kept, or `location` says which. points (P, 3): see the class on what may move.
         Both are cast to the dtype of the points. origin, offset: what the new points, or values,
         are relative to: 0 for numbers as they are, `mesh.origin` or `mesh.offset` for what was made
-        of the mesh's own. To be said where the mesh has one; else NumPy's float64 may get an offset
-        as in `from_cells`. Raises ValueError for other shapes and, outside
-        tracing, for NaN or infinite entries.
+        of the mesh's own. To be said where the mesh has one. Numbers of float64 far from 0 are held
+        relative to another one, as in `from_cells`; JAX's float32 and what is traced stay as they
+        are. Raises ValueError for other shapes and, outside tracing, for NaN or infinite entries.
+        Warns, also outside only, of lost digits as `from_cells` does.
 
         Points that mirror the mesh (an axis with another sign, two axes swapped), or a part of it
         that hangs together, turn all cells over: outside tracing its `entry` bits go with it. Where
@@ -204,37 +208,46 @@ class TetMesh:
         if origin is None:
             require_said("points", "origin", self.origin)
         place = NOWHERE if origin is None else origin_of(origin)
-        if origin is None and not isinstance(points, jax.Array):
-            points = as_floats("points", points, dtype=np.float64)
-            if points.shape == self.points.shape and is_concrete(self.cells):
-                cells = np.asarray(self.cells)
-                low, high = points[cells].min((0, 1)), points[cells].max((0, 1))
-                place = origin_between(low, high, self.dtype)
-                points = points - place
-        return self._floats("points", points), place
+        points, given = digits_of(points), points
+        wide = not isinstance(points, jax.Array)
+        if not is_concrete(points) or np.shape(points) != self.points.shape:
+            return self._floats("points", points), place
+        exact = as_floats("points", np.asarray(points), dtype=np.float64)
+        require_finite("points", exact)
+        cells = np.asarray(self.cells) if is_concrete(self.cells) else None
+        used = exact if cells is None else exact[cells.reshape(-1)]
+        away = np.asarray(origin_between(used.min(axis=0), used.max(axis=0), self.dtype))
+        if wide and (origin is None or not is_single(points)):
+            place, away = added(place, away)
+            points, exact = exact - away, exact - away
+        held = self._floats("points", points)
+        if cells is not None and is_concrete(held):  # under jit constants are not
+            coarse = coarse_cells(given, exact, np.asarray(held), away, cells)
+            if message := coarse_warning(coarse, self.n_tets):
+                warnings.warn(message, UserWarning, stacklevel=3)
+        return held, place
 
     def _values(self, values: Any, offset: Any) -> tuple[Array, float]:
         """New values as they are held, and what they are relative to."""
-        if offset is not None:
-            return self._floats("values", values), offset_of(offset)
-        require_said("values", "offset", self.offset)
-        away = 0.0
-        if not isinstance(values, jax.Array):
-            exact = as_floats("values", values, dtype=np.float64)
-            used = exact.reshape(-1)
-            if used.size and np.isfinite(used).all():
-                if exact.shape == (self.n_points,) and is_concrete(self.cells):
-                    used = exact[used_points(self)]
-                away = offset_for(values, used, self.dtype)
-            for message in (
-                rounded("values", values, self.dtype, away),
-                lost_values(values, used, away, self.dtype) if away else None,
-            ):
-                if message:
-                    warnings.warn(message, UserWarning, stacklevel=3)
-            values = exact - away
-        elif message := rounded("values", values, self.dtype):
+        if offset is None:
+            require_said("values", "offset", self.offset)
+        away = 0.0 if offset is None else offset_of(offset)
+        values, given = digits_of(values), values
+        if not is_concrete(values):
+            return self._floats("values", values), away
+        exact = as_floats("values", np.asarray(values), dtype=np.float64)
+        require_finite("values", exact)
+        used = exact.reshape(-1)
+        if exact.shape == (self.n_points,) and is_concrete(self.cells):
+            used = exact[used_points(self)]
+        if used.size == 0:
+            return self._floats("values", values), away
+        more, message = less_offset(given, used, self.dtype)
+        if message:
             warnings.warn(message, UserWarning, stacklevel=3)
+        if not isinstance(values, jax.Array) and (offset is None or not is_single(values)):
+            away, more = added(away, more)
+            values = exact - more
         return self._floats("values", values), away
 
     def _floats(self, name: str, x: Any) -> Array:
@@ -325,8 +338,8 @@ def _from_cells(
         require_sound(built)
     placed, where, away, lost = place(values, built, location, offset)
     news = dataclasses.replace(built.report, flat=0) if flat_before else built.report
-    coarse = news.coarse_warning() if origin is None else None
-    for message in (news.warning(), rounded("values", values, placed.dtype, away), coarse, lost):
+    coarse = coarse_warning(news.coarse, news.tets) if origin is None else None
+    for message in (news.warning(), coarse, lost):
         if message:
             warnings.warn(message, UserWarning, stacklevel=stacklevel)
     return trust(

@@ -61,18 +61,6 @@ class MeshReport:
         advice = f" {collapse(self.collapsed)}" if self.collapsed else ""
         return f"{' and '.join(done)}, of {made} in the mesh.{advice}" if done else None
 
-    def coarse_warning(self) -> str | None:
-        """One sentence on cells that float32 distorts, or `None` where those are few."""
-        if self.coarse <= COARSE * self.tets:
-            return None
-        return (
-            f"{self.coarse} of {self.tets} tetrahedra are so small beside the steps of float32 "
-            "where they lie that rounding moves their corners by more than a thousandth of an "
-            "edge. Write points in float64, or relative to a place in their middle; where parts of "
-            "a mesh are far from each other, turn on x64 "
-            '(jax.config.update("jax_enable_x64", True)).'
-        )
-
     def lines(self) -> list[tuple[str, str]]:
         """The report for people: labels and what stands behind them."""
 
@@ -111,5 +99,18 @@ def collapse(count: int) -> str:
     return (
         f"{count} of them have a volume in float64: points lose digits in float32, beside whose "
         "steps these cells are too small. Turn on x64 "
+        '(jax.config.update("jax_enable_x64", True)).'
+    )
+
+
+def coarse_warning(coarse: int, tets: int) -> str | None:
+    """One sentence on cells that float32 distorts, or `None` where those are few."""
+    if coarse <= COARSE * tets:
+        return None
+    return (
+        f"{coarse} of {tets} tetrahedra are so small beside the steps of float32 "
+        "where they lie that rounding moves their corners by more than a thousandth of an "
+        "edge. Write points in float64, or relative to a place in their middle; where parts of "
+        "a mesh are far from each other, turn on x64 "
         '(jax.config.update("jax_enable_x64", True)).'
     )

@@ -86,6 +86,18 @@ def offset_for(given: Any, x: np.ndarray, dtype: np.dtype) -> float:
     return offset
 
 
+def less_offset(given: Any, used: np.ndarray, dtype: np.dtype) -> tuple[float, str | None]:
+    """What to take off values, and what to say of digits that are lost all the same.
+
+    given: the values as they came. used (n,): those of them that count, float64.
+    """
+    offset = offset_for(given, used, dtype)
+    lost = rounded("values", given, dtype, offset)
+    if lost is None and not is_whole(given):
+        lost = lost_values(given, used, offset, dtype)
+    return offset, lost
+
+
 def place(
     values: Any, built: Built, location: str | None, offset: float | None = None
 ) -> tuple[np.ndarray, str, float, str | None]:
@@ -98,9 +110,7 @@ def place(
     dtype, lost = built.points.dtype, None
     if offset is None:
         used = exact[used_by(len(exact), built.cells)] if where == "point" else exact.reshape(-1)
-        offset = offset_for(values, used, dtype)
-        if not is_whole(values):  # `rounded` looks at these
-            lost = lost_values(values, used, offset, dtype)
+        offset, lost = less_offset(values, used, dtype)
         exact = exact - offset
     return cast("values", exact, dtype), where, offset, lost
 
@@ -135,11 +145,11 @@ def _place(values: Any, built: Built, location: str | None) -> tuple[np.ndarray,
 
 
 def rounded(name: str, values: Any, dtype: np.dtype, offset: float = 0.0) -> str | None:
-    """That float32 cannot hold some of these integers (ids, labels, counts), or None."""
+    """That floats cannot hold some of these integers (ids, labels, counts), or None."""
     if isinstance(values, Mapping):
         found = (rounded(f"{name}[{k!r}]", v, dtype, offset) for k, v in values.items())
         return next((message for message in found if message), None)
-    if dtype != np.float32 or not is_concrete(values):
+    if not is_concrete(values):
         return None
     if np.dtype(getattr(values, "dtype", int)).kind not in "iu":
         return None
@@ -149,7 +159,17 @@ def rounded(name: str, values: Any, dtype: np.dtype, offset: float = 0.0) -> str
         return None  # an entry for points, lines or faces, which nobody reads
     if given.dtype.kind not in "iu" or given.size == 0:
         return None
-    wide = given.astype(np.float64) - offset
+    wide = given.astype(np.float64)
+    if (high := _beyond_float64(given, wide)).any():
+        first = int(given[high][0])
+        return (
+            f"{name} has {int(high.sum())} integers that float64 cannot hold, the first is "
+            f"{first}, which becomes {int(float(first))}: above 2**53 whole numbers are rounded. "
+            "Subtract an offset, or number them anew (numpy.unique(..., return_inverse=True))."
+        )
+    if dtype != np.float32:
+        return None
+    wide = wide - offset
     lost = wide != wide.astype(np.float32)
     if not lost.any():
         return None
@@ -160,6 +180,12 @@ def rounded(name: str, values: Any, dtype: np.dtype, offset: float = 0.0) -> str
         "whole numbers are rounded. Subtract an offset, or turn on jax_enable_x64 and pass "
         'dtype="float64".'
     )
+
+
+def _beyond_float64(given: np.ndarray, wide: np.ndarray) -> np.ndarray:
+    """Which integers are others in float64, `wide`."""
+    end = 2.0 ** (8 * given.dtype.itemsize - (given.dtype.kind == "i"))  # no integer of this type
+    return np.where(wide < end, wide, 0).astype(given.dtype) != given
 
 
 def _join(values: Mapping[Any, Any], built: Built) -> np.ndarray:
