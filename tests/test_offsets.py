@@ -17,10 +17,12 @@ import pytest
 
 import jaxvr
 from jaxvr import Camera, TetMesh, TransferFunction, datasets
+from jaxvr._core.offsets import bulk
 from jaxvr.interact.orbit import Orbit
 from jaxvr.interact.viewer import Viewer
 from jaxvr.order import exact_order
 from jaxvr.testing import assert_render_close
+from jaxvr.testing.rays import scaled
 from jaxvr.trace import KBuffer
 from jaxvr.trace.rasterize import beside
 
@@ -128,8 +130,8 @@ def test_ordinary_data_have_no_offsets(dtype):
             moved = place[1] * POINTS + np.asarray(place[0])
             assert np.array_equal(scene.mesh.points, moved.astype(dtype))
     assert Scene(FIELDS["id"], PLACES["utm"], "float64").mesh.offset == 0
-    constant = BOX.replace(values=np.full(BOX.n_points, 101325.0))
-    assert constant.offset == 0
+    box = datasets.box((3, 3, 2), 0.2, dtype=dtype)
+    assert box.replace(values=np.full(box.n_points, 101325.0)).offset == 0  # a constant
 
 
 @pytest.mark.parametrize("exponent", [-40, 3, 40])
@@ -507,3 +509,172 @@ def test_what_no_offset_helps_is_told():
     with pytest.warns(UserWarning) as caught:
         TetMesh.from_cells(single, {"tetra": box.cells}, FIELD, dtype="float32")
     assert any("so small beside the steps" in str(w.message) for w in caught)
+
+
+def test_new_numbers_of_the_world_keep_their_digits(both):
+    """replace takes them with 0, as the page says; known float64 of JAX is as good as NumPy's."""
+    mesh, camera, tf = both.mesh, both.camera, both.transfer
+    points = 10 * POINTS + both.corner
+    values, eye = 101325 + 0.01 * FIELD, 10 * EYE + both.corner
+    x = 101325 + 0.01 * np.linspace(FIELD.min(), FIELD.max(), 5)
+    kinds = [np.asarray, jnp.asarray, lambda a: a.tolist()]
+    for kind in kinds if jax.config.jax_enable_x64 else (np.asarray, kinds[2]):
+        moved = mesh.replace(points=kind(points), origin=0)
+        moved = moved.replace(values=kind(values), offset=0)
+        plain = datasets.box((3, 3, 2), 0.2, dtype="float32")
+        plain = plain.replace(points=kind(points), values=kind(values))
+        for same in (moved, plain):
+            assert (same.origin, same.offset) == (mesh.origin, mesh.offset)
+            assert np.abs(same.absolute_points() - points).max() < 1e-6
+            assert np.abs(same.absolute_values() - values).max() < 1e-9
+        seen = camera.replace(eye=kind(eye), origin=0)
+        assert np.abs(np.array(seen.absolute()) - camera.absolute()).max() < 1e-6
+        made = Camera.look_at(kind(eye), kind(camera.absolute()[1]), dtype="float32")
+        assert made.origin == camera.origin
+        for same in (
+            tf.replace(positions=kind(x), offset=0),
+            TransferFunction(kind(x), COLORS, tf.extinctions, offset=0, dtype="float32"),
+            TransferFunction(kind(x), COLORS, tf.extinctions, dtype="float32"),
+            TransferFunction(
+                kind(x - 101000), COLORS, tf.extinctions, offset=101e3, dtype="float32"
+            ),
+        ):
+            assert np.abs(same.absolute_positions() - x).max() < 1e-9
+            assert np.abs(same.positions).max() < 1
+    # What is relative already stays what it is, and so do trees of the same structure.
+    for kind in (np.asarray, jnp.asarray, lambda a: np.asarray(a, np.float64)):
+        same = mesh.replace(points=kind(mesh.points), origin=mesh.origin)
+        same = same.replace(values=kind(mesh.values), offset=mesh.offset)
+        assert jax.tree.structure(same) == jax.tree.structure(mesh)
+        assert all(map(np.array_equal, jax.tree.leaves(same), jax.tree.leaves(mesh)))
+        same = camera.replace(eye=kind(camera.eye), origin=camera.origin)
+        assert all(map(np.array_equal, jax.tree.leaves(same), jax.tree.leaves(camera)))
+        same = tf.replace(positions=kind(tf.positions), offset=tf.offset)
+        assert jax.tree.structure(same) == jax.tree.structure(tf)
+        assert np.array_equal(same.positions, tf.positions)
+
+
+def test_a_start_in_float64_is_fitted_in_float32(both):
+    double = Scene(FIELDS["pascal"], PLACES["utm"], "float64").transfer
+    assert double.offset == 0 and double.astype("float32").offset == both.transfer.offset
+    how = {"iterations": 1, "learning_rate": 1e-9, "progress": False}
+    found = jaxvr.fit(double, both.mesh, [both.camera], [both.image()], **how)
+    assert np.abs(found.images[0] - both.image()).max() < 1e-4
+    assert np.abs(found.transfer.absolute_positions() - double.positions).max() < 1e-8
+
+
+def test_float32_that_lost_its_digits_is_told(both):
+    """At every door, of NumPy's as of JAX's."""
+    eye, target = both.camera.absolute()
+    x = both.transfer.absolute_positions()
+    origins, directions = both.camera.rays()
+    box = datasets.box((3, 3, 2), 0.2, dtype="float32")
+    for kind in (np.asarray, jnp.asarray):
+
+        def single(a, kind=kind):
+            return kind(np.asarray(a, np.float32))
+
+        for what, call in {
+            "steps of 0.0078 there, for": lambda: TransferFunction(
+                single(x[[0, -1]]), COLORS[:2], [1, 2], dtype="float32"
+            ),
+            "scalars come in float32": lambda: both.transfer(single(x)),
+            "values come in float32": lambda: box.replace(values=single(101325 + 0.01 * FIELD)),
+            "so small beside the steps": lambda: box.replace(points=single(POINTS + 5.2e6)),
+            "origins are float32": lambda: jaxvr.render_rays(
+                both.mesh, single(origins), directions, both.transfer
+            ),
+        }.items():
+            with pytest.warns(UserWarning, match=what):
+                call()
+    with pytest.warns(UserWarning, match="eye comes in float32, which has steps of 0.5 there, 21"):
+        Camera.look_at(np.float32(eye), target, dtype="float32")
+    for kind in (np.float32, jnp.asarray):  # whole numbers have lost nothing
+        assert kind(both.transfer(kind(np.float32([101325, 101326])))[1])[1] > 0
+    faces = np.asarray(BOX.cells)[:, :3]
+    with pytest.raises(ValueError, match="Say what these are relative to"):
+        jaxvr.rasterize(np.asarray(both.mesh.points), faces, both.camera)
+
+
+def test_rasterize_takes_the_world(both):
+    faces, world = np.asarray(BOX.cells)[:, :3], 10 * POINTS + both.corner
+    right = jaxvr.rasterize(both.mesh.points, faces, both.camera, origin=both.mesh.origin)
+    for how in ({}, {"origin": 0}):
+        drawn = jaxvr.rasterize(world, faces, both.camera, **how)
+        assert np.array_equal(drawn.pixel, right.pixel)
+        assert np.abs(drawn.depth - np.asarray(right.depth)).max() < 1e-4
+
+
+@pytest.mark.filterwarnings("ignore::jaxvr.ViewWarning")
+def test_positions_that_move_beside_each_other_are_told():
+    box = datasets.box((3, 3, 2), 0.2, dtype="float32")
+    camera = Camera.orbit(box, width=4, height=4)
+    peak = TransferFunction(
+        [101325, 101325.01, 101325.02], np.ones((3, 3)), [0, 9, 0], dtype="float32"
+    )
+    wide = box.replace(values=2e5 * POINTS[:, 0])
+    constant = box.replace(values=np.full(box.n_points, 101325.005))
+    assert wide.offset == constant.offset == 0 != peak.offset
+    for mesh in (wide, constant):
+        with pytest.warns(UserWarning, match="pairs of positions are no longer as far from each"):
+            jaxvr.render(mesh, camera, peak)
+    with pytest.warns(UserWarning, match="3 pairs of positions are no longer.*101325"):
+        TransferFunction(
+            [-1e9, 101325, 101325.01, 101325.02, 101325.03, 1e9],
+            np.ones((6, 3)),
+            np.ones(6),
+            dtype="float32",
+        )
+
+
+def test_values_that_no_float_holds_are_told(dtype):
+    box = datasets.box((3, 3, 2), 0.2, dtype=dtype)
+    for ids in (2**60 + np.arange(48), -(2**60) - np.arange(48), 2**63 + np.arange(48, dtype="u8")):
+        with pytest.warns(UserWarning, match="integers that float64 cannot hold"):
+            box.replace(values=ids)
+    few = np.where(np.arange(48) == 7, 2**63 - 1, 0)
+    with pytest.warns(UserWarning, match="1 integers that float64 cannot.*9223372036854775807"):
+        box.replace(values=few)
+    box.replace(values=np.where(np.arange(48) == 7, -(2**63), 0))  # a power of two
+    if dtype == "float32":
+        with pytest.warns(UserWarning, match="values are 0 in float32: the largest is 1e-300"):
+            box.replace(values=np.full(48, 1e-300))
+
+
+def test_outlying_values_and_parts_are_told():
+    box = datasets.box((8, 8, 8), 0.0, dtype="float32")
+    values = 101325 + 0.01 * np.sin(np.arange(box.n_points))
+    values[:4] = [0.1, 0.1001, 0.1002, 0.1003]  # fewer than one in a hundred
+    with pytest.warns(UserWarning, match="1 of the 4 different outlying values.* from 0.1 to 1013"):
+        moved = box.replace(values=values)
+    assert moved.offset
+    points = np.concatenate([POINTS, POINTS + [5, 0, 0]])
+    cells = {"tetra": np.concatenate([CELLS["tetra"], CELLS["tetra"] + len(POINTS)])}
+    with pytest.warns(UserWarning, match="inverted"):
+        two = TetMesh.from_cells(points, cells, np.concatenate([FIELD, FIELD]), dtype="float32")
+    with pytest.warns(UserWarning, match="so small beside the steps of float32"):
+        two.replace(points=np.concatenate([POINTS, POINTS + [5e6, 0, 0]]))
+
+
+def test_an_offset_does_not_depend_on_the_grid():
+    """A sample of every so many values would see one side of a structured one only."""
+    values = np.tile(np.linspace(0, 1, 64), 1 << 12)
+    values[::64] = 1000.0
+    assert bulk(values) != (1000.0, 1000.0) and bulk(values)[0] < 0.05
+
+
+def test_json_gives_the_same_bits_back():
+    far, near = [1000, 1000.5, 1001], [9, 9.1, 9.2]
+    for positions, offset in ((far, None), ([0.25, 0.5, 1], 7.0), (near, 1)):
+        x = jnp.asarray(positions, jnp.float32)
+        tf = TransferFunction(x, COLORS[:3], [1, 2, 3], offset=offset, dtype="float32")
+        back = TransferFunction.from_json(tf.to_json())
+        assert jax.tree.structure(back) == jax.tree.structure(tf)
+        assert np.array_equal(back.positions, tf.positions)
+
+
+def test_scaled_scenes_keep_their_offsets(both):
+    mesh, tf = scaled(both.mesh, both.transfer, scalar=3, length=-2)
+    assert np.array_equal(mesh.absolute_points(), both.mesh.absolute_points() / 4)
+    assert np.array_equal(mesh.absolute_values(), both.mesh.absolute_values() * 8)
+    assert np.array_equal(tf.absolute_positions(), both.transfer.absolute_positions() * 8)

@@ -114,6 +114,7 @@ def relative(x: Any, offset: Any, dtype: Any) -> Any:
     offset = np.asarray(offset, np.float64)
     if not isinstance(x, jax.Array):
         return (np.asarray(x, np.float64) - offset).astype(dtype)
+    offset = offset.reshape((1,) * (x.ndim - offset.ndim) + offset.shape)
     wide = jnp.promote_types(x.dtype, dtype)
     first = offset.astype(wide)  # of float32 not all of it: the rest goes after
     return ((x.astype(wide) - first) - (offset - first).astype(wide)).astype(dtype)

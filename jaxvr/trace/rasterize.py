@@ -26,7 +26,14 @@ from jaxvr._core.checks import (
     require_shape,
 )
 from jaxvr._core.gather import take
-from jaxvr._core.offsets import require_said
+from jaxvr._core.offsets import (
+    NOWHERE,
+    digits_of,
+    is_single,
+    origin_of,
+    relative,
+    require_said,
+)
 from jaxvr._core.pytree import pytree, static
 from jaxvr._core.units import require_lengths
 from jaxvr.order import AbstractOrder, Centroid
@@ -119,8 +126,8 @@ def rasterize(
       points (P, 3): in world units. triangles (F, 3): point ids, of either winding. values (P,):
         scalars, 0 if None. camera: its pixel centres are sampled. order: in which triangles are
         drawn; `jaxvr.order.Centroid()` if None. origin (3,): what points are relative to, which is
-        `mesh.origin` for those of a mesh; None for the world. To be said of JAX's arrays where the
-        camera has an origin.
+        `mesh.origin` for those of a mesh; None for the world. To be said of JAX's arrays and of
+        float32 where the camera has an origin.
 
     Returns:
       `Fragments`, in front of the camera only, in the widest float type of points and values.
@@ -269,14 +276,18 @@ def _fill(sort: Sort, source: Triangles, rays: Any, start: Array, room: int) -> 
 
 
 def beside(points: Any, camera: Camera, origin: Any) -> tuple[Any, Camera]:
-    """Points and camera relative to one origin."""
-    if origin is not None:
-        return points, camera.relative_to(origin)
-    if not any(camera.origin):
-        return points, camera
-    if isinstance(points, jax.Array):
-        require_said("points", "origin", camera.origin)
-    return as_floats("points", points, dtype=np.float64) - camera.origin, camera
+    """Points and camera relative to one origin: the camera's, if it has one, for known points of
+    float64, and that of the points for others."""
+    place = NOWHERE if origin is None else origin_of(origin)
+    points = digits_of(points)
+    if not any(camera.origin) or place == camera.origin:
+        return points, camera.relative_to(place)
+    if isinstance(points, jax.Array) or is_single(points):
+        if origin is None:
+            require_said("points", "origin", camera.origin)
+        return points, camera.relative_to(place)
+    by = np.asarray(camera.origin) - np.asarray(place)
+    return relative(as_floats("points", points, dtype=np.float64), by, np.float64), camera
 
 
 @jax.jit

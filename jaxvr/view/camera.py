@@ -423,9 +423,7 @@ def _make(
     )
 
 
-def _less_origin(
-    eye: Any, target: Any, dtype: Any, said: Origin | None
-) -> tuple[Any, Any, Origin]:
+def _less_origin(eye: Any, target: Any, dtype: Any, said: Origin | None) -> tuple[Any, Any, Origin]:
     """Eye and target relative to an origin near the target, where they are far from 0 beside the
     distance from one to the other, and known in more digits than those of JAX's float32."""
     origin = NOWHERE if said is None else said
