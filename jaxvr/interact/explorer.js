@@ -26,6 +26,13 @@ function draw(parent, name, attributes) {
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 const short = (x) => String(+x.toPrecision(4));
 
+// A scalar with the digits that tell a thousandth of the range: far from 0 four are too few.
+function scalar(x, low, high) {
+  const times = Math.max(Math.abs(low), Math.abs(high)) / (high - low);
+  const digits = times > 0 && times < 1e14 ? 3 + Math.ceil(Math.log10(times)) : 4;
+  return String(+x.toPrecision(Math.min(Math.max(digits, 4), 17)));
+}
+
 function stop(event) {
   event.preventDefault();
   event.stopPropagation();
@@ -281,9 +288,9 @@ function editor(setup, requests) {
     const say = (x, y, anchor, text) =>
       (draw(svg, "text", { x, y, "text-anchor": anchor }).textContent = text);
     say(left, 13, "start", `extinction, up to ${short(highest)}`);
-    say(left, height - 6, "start", short(low));
+    say(left, height - 6, "start", scalar(low, low, high));
     say(width / 2, height - 6, "middle", setup.field);
-    say(width - right, height - 6, "end", short(high));
+    say(width - right, height - 6, "end", scalar(high, low, high));
     points.forEach((p, k) => {
       const [cx, cy] = at[k];
       const name = k === selected ? "point selected" : "point";
@@ -294,7 +301,7 @@ function editor(setup, requests) {
     color.value = p.color;
     about.textContent =
       `point ${selected + 1} of ${points.length}: ` +
-      `${setup.field} ${short(p.x)}, extinction ${short(p.e)}`;
+      `${setup.field} ${scalar(p.x, low, high)}, extinction ${short(p.e)}`;
   }
 
   // Later edits of one point take the place of earlier ones.
