@@ -24,7 +24,7 @@ import jaxvr._core.quiet  # noqa: F401, I001 (first, before anything imports JAX
 from jaxvr import native, order, testing
 from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay
-from jaxvr.composite import Over
+from jaxvr.composite import MaximumIntensity, Over, XRay
 from jaxvr.defaults import default_transfer
 from jaxvr.files import save_animation, save_image, turntable
 from jaxvr.fit import FitError, FitResult, fit, fit_parameters
@@ -73,6 +73,7 @@ __all__ = [
     "Fragments",
     "KBuffer",
     "KMap",
+    "MaximumIntensity",
     "Over",
     "PartialPreIntegration",
     "PreIntegration",
@@ -85,6 +86,7 @@ __all__ = [
     "TetMesh",
     "TransferFunction",
     "ViewWarning",
+    "XRay",
     "check",
     "datasets",
     "default_transfer",

@@ -21,9 +21,10 @@ from jaxvr._core.checks import (
 from jaxvr._core.offsets import FAR, Origin, is_single, relative, said
 from jaxvr._core.warn import warn
 from jaxvr.adjoint import AbstractAdjoint, Replay
-from jaxvr.composite import Over
+from jaxvr.composite import AbstractCompositor, Over
 from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
 from jaxvr.optics.transfer import tell_coarse
+from jaxvr.optics.unshaded import Unshaded
 from jaxvr.trace import AbstractTracer, RayCast, Segments
 from jaxvr.trace.integrity import require_segments
 from jaxvr.view.camera import Camera
@@ -85,9 +86,19 @@ def _require_digits(camera: Camera, origin: Origin) -> None:
     )
 
 
-def transfer_of(transfer: Any, volume: Any) -> TransferFunction:
-    """The transfer function with positions relative to the offset of a mesh or of segments."""
-    require_kind("transfer", transfer, TransferFunction)
+def transfer_of(
+    transfer: Any, volume: Any, compositor: AbstractCompositor | None = None
+) -> TransferFunction:
+    """The transfer function with positions relative to the offset of a mesh or of segments.
+
+    compositor: what it is for; one that does not look at it gets a point in its place, for None as
+        well.
+    """
+    blind = compositor is not None and not (compositor.shades or "transfer" in compositor.needs)
+    if transfer is not None or not blind:
+        require_kind("transfer", transfer, TransferFunction)
+    if blind:
+        return TransferFunction([0.0], [[0.0] * 3], [0.0], dtype=dtype_of(volume))
     # Its numbers may have been computed with since it was made: the same checks once more.
     transfer = TransferFunction(
         transfer.positions, transfer.colors, transfer.extinctions, offset=transfer.offset
@@ -103,6 +114,11 @@ def require_positions(transfer: TransferFunction, volume: Any) -> None:
         tell_coarse(transfer.positions)
 
 
+def offset_of(volume: Any) -> Array | None:
+    """What scalars of a mesh or of segments are relative to (); None if to 0."""
+    return jnp.asarray(volume.offset, dtype_of(volume)) if volume.offset else None
+
+
 def segments_of(segments: Any) -> Segments:
     hint = "Make them with jaxvr.trace(volume, camera), or pass the volume to jaxvr.render."
     require_kind("segments", segments, Segments, hint)
@@ -114,11 +130,20 @@ def tracer_of(tracer: Any) -> AbstractTracer:
     return _noun("tracer", tracer, "prepare_rays", RayCast)
 
 
-def integrator_of(integrator: Any) -> AbstractIntegrator:
-    return _noun("integrator", integrator, "slab", Analytic)
+def integrator_of(
+    integrator: Any, compositor: AbstractCompositor | None = None
+) -> AbstractIntegrator:
+    default = Analytic if compositor is None else compositor.default_integrator
+    integrator = _noun("integrator", integrator, "slab", Analytic, default)
+    if compositor is not None and compositor.shades and isinstance(integrator, Unshaded):
+        raise ValueError(
+            f"{type(compositor).__name__} composites light, and Unshaded() gives none: take another "
+            "integrator, or leave it out."
+        )
+    return integrator
 
 
-def compositor_of(compositor: Any) -> Over:
+def compositor_of(compositor: Any) -> AbstractCompositor:
     return _noun("compositor", compositor, "finish", Over)
 
 
@@ -126,11 +151,11 @@ def adjoint_of(adjoint: Any) -> AbstractAdjoint:
     return _noun("adjoint", adjoint, "run", Replay)
 
 
-def _noun(name: str, given: Any, method: str, default: type) -> Any:
+def _noun(name: str, given: Any, method: str, usual: type, default: Any = None) -> Any:
     """What was given, or the default if that is None. It is known by a method: a user's own needs
     no base."""
     if given is None:
-        return default()
+        return (default or usual)()
     if isinstance(given, type) and hasattr(given, method):
         raise ValueError(
             f"{name} is the class {given.__name__}, not one of its objects: did you forget the ()?"
@@ -138,7 +163,7 @@ def _noun(name: str, given: Any, method: str, default: type) -> Any:
     if not hasattr(given, method):
         what = repr(given) if isinstance(given, str) else f"a {type(given).__name__}"
         raise ValueError(
-            f"{name} must be an object such as jaxvr.{default.__name__}(), but is {what}."
+            f"{name} must be an object such as jaxvr.{usual.__name__}(), but is {what}."
         )
     return given
 

@@ -22,6 +22,7 @@ import numpy as np
 from ._core.brief import spanned
 from ._core.checks import is_concrete
 from ._core.units import near_one, norm
+from .composite import AbstractCompositor
 from .optics import TransferFunction
 from .view.camera import Camera
 from .volume.mesh import TetMesh
@@ -56,12 +57,18 @@ class ViewWarning(UserWarning):
 
 
 def look(
-    volume: TetMesh, camera: Camera, transfer: TransferFunction, seen: Any, stacklevel: int
+    volume: TetMesh,
+    camera: Camera,
+    transfer: TransferFunction,
+    seen: Any,
+    compositor: AbstractCompositor,
+    stacklevel: int,
 ) -> None:
     """Warn of what is odd about a picture. All operands have the dtype of the volume.
 
-    seen (): the largest alpha of the picture, before its background. stacklevel: as for
-    `warnings.warn`, counted from the caller: 1 is the line that calls this.
+    seen (): the largest alpha of the picture, before its background. compositor: of one that does
+    not see light, only its view and, where it sees the transfer function, ranges are looked at.
+    stacklevel: as for `warnings.warn`, counted from the caller: 1 is the line that calls this.
     """
     floats = (volume.values, volume.points, camera.eye, camera.target)
     floats = (*floats, transfer.positions, transfer.extinctions)
@@ -72,17 +79,22 @@ def look(
     glance = np.asarray(_glance(camera.extent is not None, seen, corners, *floats))
     alpha, low, high, first, last, top, diagonal, cut = (float(x) for x in glance)
     low, high, first, last = (x + volume.offset for x in (low, high, first, last))
-    odd = _odd((low, high), (first, last))
+    light = compositor.shades
+    odd = (light or "transfer" in compositor.needs) and _odd((low, high), (first, last))
     # A cheap look at what `_dense` looks at again.
-    dense = top <= 1 and top * diagonal > max(DENSE, DENSE_CELL * volume.n_tets ** (1 / 3))
+    dense = light and top <= 1 and top * diagonal > max(DENSE, DENSE_CELL * volume.n_tets ** (1 / 3))
     if not (alpha < FAINT or odd or dense or cut):
         return
     low, high = value_range(volume)
     odd = odd and _odd((low, high), (first, last))
-    if not np.asarray(transfer.extinctions).any():
+    if light and not np.asarray(transfer.extinctions).any():
         return  # nothing is to be seen, and nothing is
     if alpha < FAINT:
-        message = _faint(volume, camera, transfer, alpha, (low, high))
+        if light:
+            message = _faint(volume, camera, transfer, alpha, (low, high))
+        else:
+            reason = _out_of_view(_used(volume), camera)
+            message = reason and f"The picture is blank. {reason}"
         if message:
             warnings.warn(message, ViewWarning, stacklevel=stacklevel + 1)
             return

@@ -212,9 +212,9 @@ def _walk(pipeline: Pipeline, most: int, scene: Any, table: Any, origins: Any, d
         march, place, seen, out = carry
         segment = march.trace.segment
         cell, back = tracer.locate(scene, rays, march.trace)
-        pixel, cursor, finished, _ = shade_piece(pipeline, operands, march)
+        pixel, cursor, finished, *_ = shade_piece(pipeline, operands, march)
         live = march.trace.active & finished & (segment.length > 0)
-        rgba = compositor.finish(pixel).T
+        rgba = compositor.finish(pixel, None, None).T
         scalars = jnp.stack([segment.front, segment.back], axis=1)
         new = (cell, back, segment.length, scalars, rgba - seen)
         to = jnp.where(live, place, most)

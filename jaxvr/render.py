@@ -36,13 +36,14 @@ from jaxvr.arguments import (
     compositor_of,
     dtype_of,
     integrator_of,
+    offset_of,
     rays_of,
     segments_of,
     tracer_of,
     transfer_of,
     volume_of,
 )
-from jaxvr.composite import Over
+from jaxvr.composite import AbstractCompositor, Scale
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.trace import AbstractTracer, Recorded, Segments
 from jaxvr.trace.beam import are_rays
@@ -70,11 +71,11 @@ _PARTS = 20
 def render(
     volume: TetMesh,
     camera: Camera,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
-    compositor: Over | None = None,
+    compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
     budget: int | None = None,
@@ -86,11 +87,11 @@ def render(
 def render(
     volume: TetMesh,
     camera: Camera,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
-    compositor: Over | None = None,
+    compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
     budget: int | None = None,
@@ -102,11 +103,11 @@ def render(
 def render(
     volume: TetMesh,
     camera: Camera,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
-    compositor: Over | None = None,
+    compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
     budget: int | None = None,
@@ -117,11 +118,11 @@ def render(
 def render(
     volume: TetMesh,
     camera: Camera,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
-    compositor: Over | None = None,
+    compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
     budget: int | None = None,
@@ -132,8 +133,10 @@ def render(
     Args:
       volume: a `TetMesh`.
       camera: where from, and how many pixels.
-      transfer: colour and extinction of each scalar.
-      tracer: `RayCast()` if None. integrator: `Analytic()`. compositor: `Over()`.
+      transfer: colour and extinction of each scalar. May be None with a compositor that does not
+        look at it, as `XRay()`.
+      tracer: `RayCast()` if None. compositor: `Over()`, or `MaximumIntensity()`, `XRay()`.
+        integrator: what the compositor has by default, `Analytic()` for light.
       adjoint: `Replay()`, for reverse mode; `Forward()` for forward mode, `Direct(...)` for both.
       background: opaque linear RGB (3,) behind the volume; None leaves it transparent.
       budget: bytes for the state of the rays that march at once, beside the volume and the image;
@@ -161,17 +164,18 @@ def render(
     """
     pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
     camera = camera_of(camera, volume_of(volume))
-    transfer = transfer_of(transfer, volume)
+    transfer = transfer_of(transfer, volume, pipeline.compositor)
     how = _how(pipeline, adjoint, budget, volume)
     with refusing(how[1]):
         scene = bare(volume), bare(camera), bare(transfer)
-        image, bits, seen = _render(*how, *scene, background_of(background))
+        last = offset_of(volume), background_of(background)
+        image, bits, seen = _render(*how, *scene, *last)
     bits = hold(volume, bits)
     if status:
         return image, bits
     if is_concrete(bits):
         check(bits)
-        hints.look(volume, camera, transfer, seen, stacklevel=2)
+        hints.look(volume, camera, transfer, seen, pipeline.compositor, stacklevel=2)
     return unasked(volume, image, bits)
 
 
@@ -180,11 +184,11 @@ def render_rays(
     volume: TetMesh,
     origins: Any,
     directions: Any,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
-    compositor: Over | None = None,
+    compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
     budget: int | None = None,
@@ -197,11 +201,11 @@ def render_rays(
     volume: TetMesh,
     origins: Any,
     directions: Any,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
-    compositor: Over | None = None,
+    compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
     budget: int | None = None,
@@ -214,11 +218,11 @@ def render_rays(
     volume: TetMesh,
     origins: Any,
     directions: Any,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
-    compositor: Over | None = None,
+    compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
     budget: int | None = None,
@@ -230,11 +234,11 @@ def render_rays(
     volume: TetMesh,
     origins: Any,
     directions: Any,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
-    compositor: Over | None = None,
+    compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
     budget: int | None = None,
@@ -256,11 +260,12 @@ def render_rays(
     """
     pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
     origins, directions = rays_of(origins, directions, volume_of(volume))
-    transfer = transfer_of(transfer, volume)
+    transfer = transfer_of(transfer, volume, pipeline.compositor)
     how = _how(pipeline, adjoint, budget, volume)
     with refusing(how[1]):
         scene = bare(volume), origins, directions, bare(transfer)
-        rgba, bits = _render_rays(*how, *scene, background_of(background))
+        last = offset_of(volume), background_of(background)
+        rgba, bits = _render_rays(*how, *scene, *last)
     bits = hold(volume, bits)
     if status:
         return rgba, bits
@@ -333,10 +338,10 @@ def trace(
 
 def shade(
     segments: Segments,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     *,
     integrator: AbstractIntegrator | None = None,
-    compositor: Over | None = None,
+    compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
     background: Any = None,
     budget: int | None = None,
@@ -353,10 +358,11 @@ def shade(
     """
     segments = segments_of(segments)
     pipeline = _pipeline(Recorded(), integrator, compositor)
-    transfer = transfer_of(transfer, segments)
+    transfer = transfer_of(transfer, segments, pipeline.compositor)
     how = _how(pipeline, adjoint, budget, segments)
     with refusing(how[1]):
-        image, bits = _shade(*how, bare(segments), bare(transfer), background_of(background))
+        last = offset_of(segments), background_of(background)
+        image, bits = _shade(*how, bare(segments), bare(transfer), *last)
     if is_concrete(bits):
         check(bits)
     return unfit(segments, image)
@@ -369,7 +375,7 @@ def _how(pipeline: Pipeline, adjoint: Any, budget: Any, volume: Any) -> tuple[An
 
 
 def _pipeline(
-    tracer: AbstractTracer, integrator: AbstractIntegrator | None, compositor: Over | None
+    tracer: AbstractTracer, integrator: AbstractIntegrator | None, compositor: AbstractCompositor | None
 ) -> Pipeline:
     """With what the compositor needs: segments from behind, if it goes back to front."""
     integrator, compositor = integrator_of(integrator), compositor_of(compositor)
@@ -379,28 +385,28 @@ def _pipeline(
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _render(pipeline, adjoint, size, volume, camera, transfer, background):
+def _render(pipeline, adjoint, size, volume, camera, transfer, offset, background):
     # Under a user's own jit operands may be constants: XLA must not compute with them itself.
     volume, camera = lax.optimization_barrier((volume, camera))
     height, width = camera.height, camera.width
     origins, directions = (tile(x) for x in camera.local_rays())
-    rgba, status = _run(pipeline, adjoint, size, volume, origins, directions, transfer)
+    rgba, status = _run(pipeline, adjoint, size, volume, origins, directions, transfer, offset)
     seen = lax.stop_gradient(rgba[:, 3]).max()  # for `hints`; a background hides it
     rgba = _over(untile(rgba, height, width), background)
     return rgba, untile(status[:, None], height, width)[..., 0], seen
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _render_rays(pipeline, adjoint, size, volume, origins, directions, transfer, background):
+def _render_rays(pipeline, adjoint, size, volume, origins, directions, transfer, offset, background):
     shape = origins.shape[:-1]
     volume, origins, directions = lax.optimization_barrier((volume, origins, directions))
     rays = (origins.reshape(-1, 3), directions.reshape(-1, 3))
-    rgba, status = _run(pipeline, adjoint, size, volume, *rays, transfer)
+    rgba, status = _run(pipeline, adjoint, size, volume, *rays, transfer, offset)
     return _over(rgba, background).reshape(*shape, 4), status.reshape(shape)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _shade(pipeline, adjoint, size, segments, transfer, background):
+def _shade(pipeline, adjoint, size, segments, transfer, offset, background):
     segments = lax.optimization_barrier(segments)  # as above
     units = units_of(segments.length, segments.scalar, transfer.positions, parts=_PARTS)
     segments = dataclasses.replace(
@@ -415,7 +421,8 @@ def _shade(pipeline, adjoint, size, segments, transfer, background):
     number = np.arange(rays[0].size).reshape(rays[0].shape)
     rays = (rays[0], jnp.where(number < count, rays[1], rays[0]))
     rays = pipeline.tracer.prepare_rays(scene, *rays)
-    rgba = _finish(pipeline, adjoint, scene, rays, transfer, scene.scalar.dtype, count)[0]
+    scale = Scale(units.scalar, units.length, offset)
+    rgba = _finish(pipeline, adjoint, scene, rays, transfer, scale, count)[0]
     rgba = jnp.zeros_like(rgba).at[segments.order].set(rgba, unique_indices=True)
     return _over(rgba, background).reshape(*segments.shape, 4), units.status
 
@@ -446,7 +453,7 @@ def _fill(tracer, native, size, volume, origins, directions, start, total):
     return Nodes(nodes.scalar / units.scalar, nodes.length / units.length)
 
 
-def _run(pipeline, adjoint, size, volume, origins, directions, transfer):
+def _run(pipeline, adjoint, size, volume, origins, directions, transfer, offset):
     """rgba (R, 4) and status (R,) of rays (R, 3)."""
     units = units_of(volume.points, volume.values, transfer.positions)
     volume, origins = mesh_in(units, volume), origins * units.length
@@ -454,7 +461,8 @@ def _run(pipeline, adjoint, size, volume, origins, directions, transfer):
     scene = pipeline.tracer.prepare(volume)
     rays, count = batches(size, (origins, directions))
     rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(*rays)
-    rgba, status = _finish(pipeline, adjoint, scene, rays, transfer, origins.dtype, count)
+    scale = Scale(units.scalar, units.length, offset)
+    rgba, status = _finish(pipeline, adjoint, scene, rays, transfer, scale, count)
     status = jnp.where(are_rays(origins.T, directions.T), status, status | LOST)
     good = _in_range(volume, getattr(adjoint, "native", False))
     return rgba, jnp.where(good, status, BROKEN) | units.status
@@ -472,10 +480,12 @@ def _in_range(volume: Any, compiled_loops: Any) -> Array:
     return good & jnp.all((words >= -1) & (words >> 4 < count))
 
 
-def _finish(pipeline, adjoint, scene, rays, transfer, dtype, count):
+def _finish(pipeline, adjoint, scene, rays, transfer, scale, count):
     longest = lax.stop_gradient(pipeline.tracer.longest(scene))
-    table = pipeline.integrator.prepare(transfer, dtype, longest)
-    rgba, status = adjoint.run(pipeline, Operands(scene, rays, table))
+    table = pipeline.integrator.prepare(transfer, longest.dtype, longest)
+    state, status = adjoint.run(pipeline, Operands(scene, rays, table))
+    finish = pipeline.compositor.finish
+    rgba = jax.vmap(lambda state: finish(state, transfer, scale))(state)
     return jnp.moveaxis(rgba, 1, 2).reshape(-1, 4)[:count], status.reshape(-1)[:count]
 
 

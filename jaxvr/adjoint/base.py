@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core.modes import custom_vjp_refused
-from jaxvr.composite.over import Over
+from jaxvr.composite.base import AbstractCompositor, Piece
 from jaxvr.optics.integrator import AbstractIntegrator
 from jaxvr.optics.partition import Cursor
 from jaxvr.trace.base import AbstractTracer
@@ -32,7 +32,7 @@ class Pipeline:
 
     tracer: AbstractTracer
     integrator: AbstractIntegrator
-    compositor: Over
+    compositor: AbstractCompositor
 
 
 class Operands(NamedTuple):
@@ -60,8 +60,9 @@ class AbstractAdjoint(abc.ABC):
     no_forward_mode: ClassVar[str | None] = None
 
     @abc.abstractmethod
-    def run(self, pipeline: Pipeline, operands: Operands) -> tuple[Array, Array]:
-        """Premultiplied RGBA (batches, 4, R) and status (batches, R)."""
+    def run(self, pipeline: Pipeline, operands: Operands) -> tuple[Any, Array]:
+        """The compositor's state at the end of each ray, leaves (batches, ..., R), and status
+        (batches, R). What `finish` makes of the state is differentiated by JAX."""
 
 
 def refusing(adjoint: Any) -> contextlib.AbstractContextManager[None]:
@@ -75,7 +76,7 @@ def begin(pipeline: Pipeline, operands: Operands) -> March:
     trace = pipeline.tracer.start(operands.scene, operands.rays)
     front = trace.segment.front
     cursor = pipeline.integrator.start(operands.table, front)
-    return March(trace, cursor, pipeline.compositor.start(front.shape[0], front.dtype))
+    return March(trace, cursor, pipeline.compositor.init(front.shape[0], front.dtype))
 
 
 def busy(march: March) -> Array:
@@ -83,17 +84,19 @@ def busy(march: March) -> Array:
 
 
 def shade_piece(pipeline: Pipeline, operands: Operands, march: March):
-    """Composites the current pieces: the pixel behind them, the cursor, what is finished, and
-    the pieces."""
+    """Composites the current pieces: the pixel behind them, the cursor, what is finished, the
+    pieces, and what the integrator wants to know of them."""
     with jax.named_scope("shade"):
-        rgb, depth, cursor, finished, piece = pipeline.integrator.step(
-            operands.table, march.trace.segment, march.cursor
+        segment = march.trace.segment
+        rgb, depth, cursor, finished, cut = pipeline.integrator.step(
+            operands.table, segment, march.cursor
         )
         live = march.trace.active
-        pixel = pipeline.compositor.add(
-            march.pixel, jnp.where(live[None], rgb, 0), jnp.where(live, depth, 0)
+        piece = Piece(
+            jnp.where(live[None], rgb, 0), jnp.where(live, depth, 0), segment, live & finished
         )
-    return pixel, cursor, finished, piece
+        pixel = pipeline.compositor.add(march.pixel, piece)
+    return pixel, cursor, finished, piece, cut
 
 
 def advance(pipeline: Pipeline, operands: Operands, march: March, finished: Array) -> March:
@@ -103,7 +106,7 @@ def advance(pipeline: Pipeline, operands: Operands, march: March, finished: Arra
       march: pixel and cursor are those behind the current pieces. finished (R,): by these pieces.
     """
     trace, cursor, pixel = march
-    ended = pipeline.compositor.ended(pixel)
+    ended = pipeline.compositor.done(pixel)
     if ended is not None:
         # Not inside of a segment: the derivative with respect to where a piece ends is left out,
         # since it cancels between the pieces of a segment (see `optics.partition`).
@@ -122,7 +125,7 @@ def advance(pipeline: Pipeline, operands: Operands, march: March, finished: Arra
 
 
 def iterate(pipeline: Pipeline, operands: Operands, march: March) -> March:
-    pixel, cursor, finished, _ = shade_piece(pipeline, operands, march)
+    pixel, cursor, finished, *_ = shade_piece(pipeline, operands, march)
     return advance(pipeline, operands, March(march.trace, cursor, pixel), finished)
 
 
@@ -131,10 +134,11 @@ def march_while(pipeline: Pipeline, operands: Operands) -> March:
     return lax.while_loop(busy, lambda m: iterate(pipeline, operands, m), begin(pipeline, operands))
 
 
-def finish(pipeline: Pipeline, march: March) -> tuple[Array, Array]:
-    return pipeline.compositor.finish(march.pixel), march.trace.status
+def result(march: March) -> tuple[Any, Array]:
+    """What `run` gives, of one batch."""
+    return march.pixel, march.trace.status
 
 
-def run_batches(one: Any, operands: Operands) -> tuple[Array, Array]:
+def run_batches(one: Any, operands: Operands) -> tuple[Any, Array]:
     """`one(operands with one batch of rays)` for each batch, one after the other."""
     return lax.map(lambda rays: one(operands._replace(rays=rays)), operands.rays)

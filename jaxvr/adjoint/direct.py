@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core import status
-from jaxvr.adjoint.base import AbstractAdjoint, begin, busy, finish, iterate, run_batches
+from jaxvr.adjoint.base import AbstractAdjoint, begin, busy, iterate, result, run_batches
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Direct(AbstractAdjoint):
                 return march, None
 
             march, _ = lax.scan(body, begin(pipeline, batch), length=self.max_steps)
-            rgba, bits = finish(pipeline, march)
+            pixel, bits = result(march)
             late = march.trace.active | march.trace.waiting
-            return rgba, bits | jnp.where(late, status.STEPS, 0)
+            return pixel, bits | jnp.where(late, status.STEPS, 0)
 
         return run_batches(one, operands)

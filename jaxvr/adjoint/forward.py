@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from jaxvr._core.modes import forward_only
-from jaxvr.adjoint.base import AbstractAdjoint, finish, march_while, run_batches
+from jaxvr.adjoint.base import AbstractAdjoint, march_while, result, run_batches
 
 _REVERSE = (
     "Forward gives forward mode (jvp, jacfwd, linearize) only. For reverse mode (grad, vjp, "
@@ -24,5 +24,5 @@ class Forward(AbstractAdjoint):
     """
 
     def run(self, pipeline, operands):
-        result = run_batches(lambda one: finish(pipeline, march_while(pipeline, one)), operands)
-        return forward_only(result, _REVERSE)
+        found = run_batches(lambda one: result(march_while(pipeline, one)), operands)
+        return forward_only(found, _REVERSE)

@@ -45,8 +45,9 @@ from jaxvr.adjoint.base import (
     advance,
     begin,
     busy,
-    finish,
     march_while,
+    result,
+    run_batches,
     shade_piece,
 )
 
@@ -110,24 +111,25 @@ def _run(pipeline: Pipeline, compiled: bool, operands: Operands):
     operands = operands._replace(table=pipeline.integrator.shorten(operands.table, True))
 
     if compiled:
-        scene, rays, table = operands
-        pixel, status = native.kernels.composite(
-            scene, rays, table, pipeline.integrator, pipeline.compositor
-        )
+        pixel, status = native.kernels.composite(pipeline, operands)
         shape = jax.tree.leaves(operands.rays)[0].shape
-        rgba = pipeline.compositor.finish(pixel).reshape(4, *shape)
-        return (jnp.moveaxis(rgba, 0, 1), status.reshape(shape)), pixel
+        return jax.tree.map(lambda x: _by_batch(x, shape), pixel), status.reshape(shape)
+    return run_batches(lambda one: result(march_while(pipeline, one)), operands)
 
-    def one(rays):
-        march = march_while(pipeline, operands._replace(rays=rays))
-        return finish(pipeline, march), march.pixel
 
-    return lax.map(one, operands.rays)
+def _by_batch(x: Array, shape: tuple[int, ...]) -> Array:
+    """(..., N) of N rays as (batches, ..., R) of batches of R."""
+    return jnp.moveaxis(x.reshape(*x.shape[:-1], *shape), -2, 0)
+
+
+def _flat(x: Array) -> Array:
+    """Back again."""
+    return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _replay(pipeline: Pipeline, compiled: bool, operands: Operands) -> tuple[Array, Array]:
-    return _run(pipeline, compiled, operands)[0]
+def _replay(pipeline: Pipeline, compiled: bool, operands: Operands) -> tuple[Any, Array]:
+    return _run(pipeline, compiled, operands)
 
 
 def _forward(pipeline: Pipeline, compiled: bool, primals: Any):
@@ -135,16 +137,13 @@ def _forward(pipeline: Pipeline, compiled: bool, primals: Any):
         primals, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
     )
     operands = structure.unflatten([leaf.value for leaf in leaves])
-    result, pixel = _run(pipeline, compiled, constant(operands, _SECOND))
-    return result, (operands, pixel, _flags([leaf.perturbed for leaf in leaves]))
+    found = _run(pipeline, compiled, constant(operands, _SECOND))
+    return found, (operands, found[0], _flags([leaf.perturbed for leaf in leaves]))
 
 
 def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: Any):
     operands, finals, asked = residuals
-    rgba_bar, _ = cotangents
-    if isinstance(rgba_bar, jax.custom_derivatives.SymbolicZero):
-        aval: Any = rgba_bar.aval
-        rgba_bar = jnp.zeros(aval.shape, aval.dtype)
+    state_bar = jax.tree.map(_cotangent, finals, cotangents[0])
     tracer, integrator = pipeline.tracer, pipeline.integrator
     structure = jax.tree.structure(operands)
     perturbed: Operands = jax.tree.unflatten(structure, [flag.shape[0] == 1 for flag in asked])
@@ -152,18 +151,18 @@ def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: An
     # Where it is transparent, segments have no gradient, but the transfer function has.
     table = operands.table if optical else integrator.shorten(operands.table, False)
     if compiled:
-        rgba_bar = constant(rgba_bar, _SECOND)
+        state_bar = constant(state_bar, _SECOND)
         scene_bar, rays_bar, table_bar = native.kernels.pull_back(
-            *(operands.scene, operands.rays, table, integrator, pipeline.compositor),
-            final=finals,
-            rgba_bar=jnp.moveaxis(rgba_bar, 1, 0).reshape(4, -1),
+            *(pipeline, operands._replace(table=table)),
+            final=jax.tree.map(_flat, finals),
+            cotangent=jax.tree.map(_flat, state_bar),
             asked=(perturbed.scene, perturbed.rays, optical),
         )
         rays_bar = _floats(tracer.rays_cotangent(operands.rays, rays_bar))
     else:
         walked = operands._replace(table=table)
         scene_bar, rays_bar, table_bar = _walk_again(
-            pipeline, walked, finals, rgba_bar, perturbed, optical
+            pipeline, walked, finals, state_bar, perturbed, optical
         )
     scene_bar = _floats(tracer.scene_cotangent(operands.scene, scene_bar))
     if optical:
@@ -181,7 +180,7 @@ def _walk_again(
     pipeline: Pipeline,
     operands: Operands,
     finals: Any,
-    rgba_bar: Array,
+    state_bar: Any,
     perturbed: Operands,
     optical: bool,
 ) -> tuple[Any, list[Array], Any]:
@@ -197,13 +196,17 @@ def _walk_again(
 
         def body(loop):
             march, table_bar, trace_bar = loop
-            pixel, cursor, finished, piece = shade_piece(pipeline, one, march)
-            live = march.trace.active
-            rgb_bar, depth_bar = compositor.pull_back(march.pixel, pixel, final, pixel_bar)
-            piece_bar = jnp.where(live[None], rgb_bar, 0), jnp.where(live, depth_bar, 0)
-            segment_bar, table_bar = integrator.pull_back(
-                one.table, march.trace.segment, piece, piece_bar, table_bar
-            )
+            pixel, cursor, finished, piece, cut = shade_piece(pipeline, one, march)
+            segment, live = march.trace.segment, march.trace.active
+            bar = compositor.pull_back(piece, march.pixel, pixel, final, pixel_bar)
+            segment_bar = bar.segment
+            if compositor.shades:
+                rgb_bar = jnp.zeros_like(piece.rgb) if bar.rgb is None else bar.rgb
+                piece_bar = jnp.where(live[None], rgb_bar, 0), jnp.where(live, bar.optical_depth, 0)
+                by_light, table_bar = integrator.pull_back(
+                    one.table, segment, cut, piece_bar, table_bar
+                )
+                segment_bar = _sum(by_light, segment_bar)
             if geometric:
                 trace_bar = tracer.pull_back(one.scene, rays, march.trace, segment_bar, trace_bar)
             march = advance(pipeline, one, March(march.trace, cursor, pixel), finished)
@@ -223,9 +226,22 @@ def _walk_again(
     table_bar = integrator.gradient_start(operands.table) if optical else None
     small = optical and sum(x.size for x in jax.tree.leaves(table_bar)) <= _SMALL_TABLE
     (scene_bar, table_bar), rays_bar = lax.scan(
-        batch, (scene_bar, table_bar), (operands.rays, finals, rgba_bar)
+        batch, (scene_bar, table_bar), (operands.rays, finals, state_bar)
     )
     return scene_bar, rays_bar, table_bar
+
+
+def _cotangent(primal: Array, cotangent: Any) -> Array | None:
+    """The cotangent of a leaf of the state; None for integers."""
+    if not jnp.issubdtype(primal.dtype, jnp.floating):
+        return None
+    if isinstance(cotangent, jax.custom_derivatives.SymbolicZero):
+        return jnp.zeros_like(primal)
+    return cotangent
+
+
+def _sum(a: Any, b: Any) -> Any:
+    return a if b is None else jax.tree.map(jnp.add, a, b)
 
 
 def _floats(tree: Any) -> list[Array]:

@@ -40,9 +40,11 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 
+from jaxvr.composite.base import AbstractCompositor, Piece
 from jaxvr.numerics import compensated
 from jaxvr.numerics.compensated import Sum
 from jaxvr.numerics.moments import opacity
+from jaxvr.optics.analytic import Analytic
 
 Array = jax.Array
 Direction = Literal["front to back", "back to front"]
@@ -56,7 +58,7 @@ class OverState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Over:
+class Over(AbstractCompositor):
     """Emission and absorption (the density emitter of Williams and Max 1992).
 
     termination: a ray ends behind the first segment where its transmittance is at most this; 0
@@ -104,16 +106,21 @@ class Over:
 
     @property
     def backwards(self) -> bool:
-        """Whether pieces are to be added farthest first."""
         return self.direction == "back to front"
 
-    def start(self, rays: int, dtype: Any) -> OverState:
-        """The state of R `rays` before their first piece."""
+    @property
+    def needs(self):
+        return frozenset({"rgb", "optical_depth"})
+
+    def default_integrator(self):
+        return Analytic()
+
+    def init(self, rays, dtype):
         zero, zeros = jnp.zeros(rays, dtype), jnp.zeros((3, rays), dtype)
         return OverState((zero, zero), (zeros, zeros))
 
-    def add(self, state: OverState, rgb: Array, depth: Array) -> OverState:
-        """The state with one more piece, of premultiplied rgb (3, R) and optical depth (R,)."""
+    def add(self, state, piece):
+        rgb, depth = piece.rgb, piece.optical_depth
         if self.backwards:
             return _add_in_front(state, rgb, depth)
         through = compensated.exp_minus(state.depth)
@@ -127,27 +134,28 @@ class Over:
         """The optical depth at which a ray ends; infinite if none ends so."""
         return -math.log(self.termination) if self.termination else math.inf
 
-    def ended(self, state: OverState) -> Array | None:
-        """Rays (R,) that need nothing from behind; None if no ray ever ends so."""
+    def done(self, state):
         if self.termination == 0:
             return None
         return compensated.value(state.depth) >= self.enough
 
-    def finish(self, state: OverState) -> Array:
-        """Premultiplied RGBA (4, R)."""
+    def finish(self, state, transfer, scale):
         alpha = opacity(compensated.value(state.depth))
         return jnp.concatenate([compensated.value(state.rgb), alpha[None]])
 
-    def pull_back(
-        self, before: OverState, after: OverState, final: OverState, cotangent: Array
-    ) -> tuple[Array, Array]:
-        """Cotangents of one piece's rgb (3, R) and depth (R,), given that of the RGBA (4, R)."""
+    def merge(self, front, back):
+        through = compensated.exp_minus(front.depth)[None]
+        total, excess = compensated.add(front.depth, back.depth[0])
+        light, lost = compensated.add(front.rgb, through * back.rgb[0])
+        return OverState((total, excess + back.depth[1]), (light, lost + through * back.rgb[1]))
+
+    def pull_back(self, piece, before, after, final, cotangent):
+        rgb_bar, depth_bar = cotangent.rgb[0], cotangent.depth[0]
         if self.backwards:
-            return _pull_back_in_front(before, after, final, cotangent)
+            return _pull_back_in_front(before, after, final, rgb_bar, depth_bar)
         behind = compensated.difference(final.rgb, after.rgb)
-        through = compensated.exp_minus(final.depth)
-        depth_bar = cotangent[3] * through - jnp.sum(cotangent[:3] * behind, axis=0)
-        return compensated.exp_minus(before.depth)[None] * cotangent[:3], depth_bar
+        through = compensated.exp_minus(before.depth)[None]
+        return Piece(through * rgb_bar, depth_bar - jnp.sum(rgb_bar * behind, axis=0), None, None)
 
 
 def _add_in_front(state: OverState, rgb: Array, depth: Array) -> OverState:
@@ -161,11 +169,9 @@ def _add_in_front(state: OverState, rgb: Array, depth: Array) -> OverState:
 
 
 def _pull_back_in_front(
-    before: OverState, after: OverState, final: OverState, cotangent: Array
-) -> tuple[Array, Array]:
+    before: OverState, after: OverState, final: OverState, rgb_bar: Array, depth_bar: Array
+) -> Piece:
     """`Over.pull_back` for such a piece: T_i by what is in front of it, T_{i+1} with itself."""
     to, past = (jnp.exp(-compensated.difference(final.depth, s.depth)) for s in (after, before))
     behind = past[None] * compensated.value(before.rgb)
-    through = compensated.exp_minus(final.depth)
-    depth_bar = cotangent[3] * through - jnp.sum(cotangent[:3] * behind, axis=0)
-    return to[None] * cotangent[:3], depth_bar
+    return Piece(to[None] * rgb_bar, depth_bar - jnp.sum(rgb_bar * behind, axis=0), None, None)

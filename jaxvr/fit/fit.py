@@ -32,7 +32,7 @@ from jaxvr.arguments import (
     tracer_of,
     volume_of,
 )
-from jaxvr.composite import Over
+from jaxvr.composite import AbstractCompositor
 from jaxvr.defaults import diagonal
 from jaxvr.fit.batches import Batch, Views, deal, gather_views, here, listed, make_batches
 from jaxvr.fit.belongs import belongs
@@ -80,7 +80,7 @@ def fit(
     resume: bool = False,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
-    compositor: Over | None = None,
+    compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
 ) -> FitResult:
     """Fits a transfer function to pictures of a volume.
@@ -132,8 +132,11 @@ def fit(
     `fit_parameters`.
     """
     require_kind("transfer", transfer, TransferFunction)
-    nouns = integrator_of(integrator), compositor_of(compositor), adjoint_of(adjoint)
-    nouns = (*nouns, tracer_of(tracer))
+    pixels = compositor_of(compositor)
+    if not (pixels.shades or "transfer" in pixels.needs):
+        raise ValueError(f"{pixels!r} does not look at the transfer function: nothing to fit.")
+    given = integrator_of(integrator, pixels), pixels, adjoint_of(adjoint)
+    nouns = (*given, tracer_of(tracer))
     begin = time.perf_counter()
     control = Control(
         *(iterations, seed, progress, patience, tolerance, checkpoint, checkpoint_every, resume)
@@ -183,7 +186,7 @@ def fit(
     about = belongs(
         {"verb": "fit", "cache": bool(cache), "dtype": str(dtype)} | named,
         objective,
-        (integrator_of(integrator), compositor_of(compositor), adjoint_of(adjoint)),
+        given,
         (volume, cameras[:number_seen], seen),
         (parameters, background),
         weights,
@@ -259,7 +262,7 @@ class Objective:
 
     loss: Callable[[Array, Array], Array]
     integrator: AbstractIntegrator
-    compositor: Over
+    compositor: AbstractCompositor
     adjoint: AbstractAdjoint
     tracer: AbstractTracer
 

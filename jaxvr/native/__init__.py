@@ -24,11 +24,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxvr.composite.over import Over
+from jaxvr.composite import MaximumIntensity, Over, XRay
 from jaxvr.native import build, kernels
 from jaxvr.optics.analytic import Analytic
+from jaxvr.optics.unshaded import Unshaded
 from jaxvr.trace.raycast import RayCast
 from jaxvr.trace.recorded import Recorded
+
+
+_WRITTEN = (RayCast, Recorded, Analytic, Unshaded, Over, MaximumIntensity, XRay)
 
 
 def missing(dtype: Any = "float32") -> str | None:
@@ -53,7 +57,7 @@ def covers(wanted: bool | None, dtype: Any, *nouns: Any) -> bool:
     """
     if wanted is False:
         return False
-    others = [n for n in nouns if type(n) not in (RayCast, Recorded, Analytic, Over)]
+    others = [n for n in nouns if type(n) not in _WRITTEN]
     if any(isinstance(n, Over) and n.backwards for n in nouns) or Recorded(reverse=True) in nouns:
         reason = "They go front to back."
     elif others:

@@ -5,6 +5,8 @@ Rays are flat here, (N,); the loops make blocks of their own, which XLA's thread
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -12,7 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxvr.composite.maximum_intensity import MaximumIntensity, MaximumState
 from jaxvr.composite.over import Over, OverState
+from jaxvr.composite.xray import XRay, XRayState
 from jaxvr.native.build import target_name
 from jaxvr.numerics.rules import Rule, rule_for, thin_rule
 from jaxvr.optics.analytic import RULES
@@ -28,48 +32,43 @@ LOCATIONS = {"point": 0, "cell": 1, "corner": 2}
 PAIR = 10  # numbers of a row of `AbstractSlabIntegrator.gradient_start`
 
 
-def composite(
-    scene: Any, rays: Any, table: Nodes, integrator: Any, over: Over
-) -> tuple[OverState, Array]:
-    """Final sums and status (N,) of rays (N,), cast through a `CastScene` or played back.
-
-    integrator: an `Analytic`.
-    """
-    dtype = table.position.dtype
+def composite(pipeline: Any, operands: Any) -> tuple[Any, Array]:
+    """The compositor's state and status (N,) of rays (N,), cast through a `CastScene` or played
+    back. pipeline, operands: as `adjoint.base` has them; what `covers` says."""
+    scene, rays, _ = operands
     world, count = _world(scene, rays)
-    shapes = [Shape((8, count), dtype), Shape((count,), jnp.int32)]
-    optics = _optics(table, integrator, over)
+    dtype = _dtype_of(scene)
+    integers = Shape((2, count if _has_place(pipeline) else 0), jnp.int32)
+    operands = (*world, *_optics(pipeline, operands, dtype))
+    sums, status = Shape((8, count), dtype), Shape((count,), jnp.int32)
     if isinstance(scene, Recording):
-        (sums,) = _call("shade", dtype, shapes[:1])(*world, *optics)
+        sums, integers = _call("shade", dtype, [sums, integers])(*operands)
         status = jnp.zeros(count, jnp.int32)
     else:
-        sums, status = _call("render", dtype, shapes)(*world, *optics)
+        sums, status, integers = _call("render", dtype, [sums, status, integers])(*operands)
+    if isinstance(pipeline.compositor, MaximumIntensity):
+        return MaximumState(sums[0], integers[0], integers[1]), status
+    if isinstance(pipeline.compositor, XRay):
+        return XRayState((sums[0], sums[4]), (sums[1], sums[5])), status
     return OverState((sums[0], sums[4]), (sums[1:4], sums[5:8])), status
 
 
 def pull_back(
-    scene: Any,
-    rays: Any,
-    table: Nodes,
-    integrator: Any,
-    over: Over,
-    *,
-    final: OverState,
-    rgba_bar: Array,
-    asked: tuple[Any, Any, bool],
+    pipeline: Any, operands: Any, *, final: Any, cotangent: Any, asked: tuple[Any, Any, bool]
 ) -> tuple[Any, Any, Any]:
     """Gradients of the scene, the rays and the table, as `gradient_start` of tracer and integrator
     has them.
 
     Args:
-      final: from `composite`. rgba_bar (4, N): cotangent of the pixels.
+      final, cotangent: from `composite`, and that of it.
       asked: structures of (scene, rays) with True at leaves that are asked for, and whether the
         table is.
     """
-    dtype = table.position.dtype
+    scene, rays, table = operands
     world, count = _world(scene, rays)
-    sums = jnp.stack([final.depth[0], *final.rgb[0], final.depth[1], *final.rgb[1]])
-    operands = (*world, *_optics(table, integrator, over), sums, rgba_bar)
+    dtype = _dtype_of(scene)
+    operands = (*world, *_optics(pipeline, operands, dtype))
+    operands = (*operands, *_finals(pipeline.compositor, final, cotangent))
     ask_scene, ask_rays, ask_table = asked
     rows = Shape((2 * table.position.shape[0] if ask_table else 0, PAIR), dtype)
 
@@ -141,13 +140,58 @@ def _world(scene: Any, rays: Any) -> tuple[tuple[Any, ...], int]:
     return arrays, rays.origin_x.size
 
 
-def _optics(table: Nodes, integrator: Any, over: Over) -> tuple[Any, ...]:
-    dtype = table.position.dtype
-    small = RULES[integrator.accuracy]
+def _dtype_of(scene: Any) -> Any:
+    return (scene.scalar if isinstance(scene, Recording) else scene.mesh.coordinates).dtype
+
+
+def _has_place(pipeline: Any) -> bool:
+    return isinstance(pipeline.compositor, MaximumIntensity)
+
+
+def _kind(compositor: Any) -> int:
+    """`Compositor` of src/whole.h."""
+    if isinstance(compositor, XRay):
+        return 1 if compositor.shades else 2
+    return 3 if isinstance(compositor, MaximumIntensity) else 0
+
+
+def _finals(compositor: Any, final: Any, cotangent: Any) -> tuple[Array, Array, Array]:
+    """Sums (8, N), cotangents (4, N) and where the largest scalars are, (N,) or (0,)."""
+    none = jnp.zeros(0, jnp.int32)
+    if isinstance(compositor, Over):
+        sums = [final.depth[0], *final.rgb[0], final.depth[1], *final.rgb[1]]
+        bars = [*cotangent.rgb[0], cotangent.depth[0]]
+        return jnp.stack(sums), jnp.stack(bars), none
+    if isinstance(compositor, MaximumIntensity):
+        zero = jnp.zeros_like(final.largest)
+        bars = [cotangent.largest, zero, zero, zero]
+        return jnp.stack([final.largest, *[zero] * 7]), jnp.stack(bars), final.where
+    (integral, lost), (length, missed) = final
+    zero = jnp.zeros_like(integral)
+    sums = [integral, length, zero, zero, lost, missed, zero, zero]
+    by_integral, by_length = cotangent.integral[0], cotangent.length[0]
+    bars = [by_integral, by_length, zero, zero]
+    if compositor.shades:
+        bars = [zero, zero, zero, by_integral]
+    return jnp.stack(sums), jnp.stack(bars), none
+
+
+def _optics(pipeline: Any, operands: Any, dtype: Any) -> tuple[Any, ...]:
+    table, compositor = operands.table, pipeline.compositor
+    enough = compositor.enough if isinstance(compositor, Over) else math.inf
+    kind = _kind(compositor)
+    if not compositor.shades:
+        rules = np.zeros((5, 0), dtype)
+        numbers = np.array([0, 0, 0, enough, kind], dtype)
+        return jnp.zeros(1, dtype), jnp.zeros((2, 16), dtype), rules, rules, numbers
+    if isinstance(compositor, XRay):  # no light: a place for lengths
+        optical = table.optical.at[1:].set(0)
+        table = dataclasses.replace(table, optical=optical)
+    small = RULES[pipeline.integrator.accuracy]
     rule = small or rule_for(dtype)
     thin = thin_rule(dtype)
     rows = (_rows(r).astype(dtype) for r in (rule, thin))
-    numbers = np.array([rule.depth, small is not None, thin.depth, over.enough], dtype)
+    numbers = np.array([rule.depth, small is not None, thin.depth, enough, kind], dtype)
     return table.position, slabs_of(table), *rows, numbers
 
 

@@ -3,11 +3,13 @@
 #include "play.h"
 #include "pull.h"
 #include "walk.h"
+#include "whole.h"
 
 typedef struct {
   Transfer transfer;
   Rule rule;
   real enough;
+  Compositor compositor;
 } Optics;
 
 /* Gradients of one group of blocks, until they are added to those of all. */
@@ -33,16 +35,18 @@ typedef struct {
   Optics optics;
   int64_t count; /* rays */
   Watch watch;
-  /* results of a picture, (8, N) and (N,) */
+  /* results of a picture, (8, N), (N,), and (2, N) or NULL: WHERE and the number of segments */
   real *sums;
-  int32_t *status;
+  int32_t *status, *where;
   /* of the number of nodes, and the nodes themselves from `start` (N,) on */
   int32_t *number;
   const int32_t *start;
   real *scalar, *length;
   int64_t total; /* of them */
-  /* operands of derivatives: sums, the pixels' cotangents (4, N); and gradients, or NULL */
+  /* operands of derivatives: sums, cotangents (4, N) of those of light and depth in this order, or of
+   * the first two, WHERE (N,) or NULL; and gradients, or NULL */
   const real *finals, *pixel_bar;
+  const int32_t *goal;
   real *vertices_bar, *values_bar, *rays_bar;
   double *table_bar;
   int64_t table_size, vertices_size, values_size;
@@ -83,6 +87,7 @@ static Optics optics_of(XLA_FFI_CallFrame *frame, int first) {
   optics.rule.small = numbers[1] != 0;
   optics.rule.limit = numbers[2];
   optics.enough = numbers[3];
+  optics.compositor = (Compositor)numbers[4];
   return optics;
 }
 
@@ -110,15 +115,47 @@ static Block *new_block(Task *task) {
 
 /* ---- pictures ---- */
 
+/* The segments of the lanes go into their pixels. */
+static void composite_segments(const Optics *optics, Lanes *lanes, int n) {
+  switch (optics->compositor) {
+  case INTEGRAL: add_integrals(lanes, n); return;
+  case MAXIMUM: add_largest(lanes, n); return;
+  case DEPTHS: add_lengths(lanes, n); /* and */
+  case OVER: shade(&optics->transfer, &optics->rule, lanes, n);
+  }
+}
+
+/* The same with derivatives: SBAR, TBAR and `table`. */
+static void pull_segments(const Optics *optics, Lanes *lanes, int n, double *table) {
+  switch (optics->compositor) {
+  case INTEGRAL: pull_integrals(lanes, n); return;
+  case MAXIMUM: pull_largest(lanes, n); return;
+  default: pull_shading(&optics->transfer, &optics->rule, lanes, n, table);
+  }
+}
+
 static void keep_sums(void *data, Lanes *lanes, int lane) {
   Task *task = data;
   int64_t n = task->count, r = lanes->integer[RAY][lane];
   for (int k = 0; k < 8; k++) task->sums[k * n + r] = lanes->row[SUMS + k][lane];
   if (task->status) task->status[r] = lanes->integer[LOST][lane] ? STATUS_LOST : 0;
+  if (!task->where) return;
+  task->where[r] = lanes->integer[WHERE][lane];
+  task->where[n + r] = lanes->integer[SLAB][lane];
 }
 
 static void clear_rays(real *rows, int count, int64_t n, int64_t first, int rays) {
   for (int k = 0; k < count; k++) memset(rows + k * n + first, 0, rays * sizeof(real));
+}
+
+/* Results of rays that meet nothing; and what lanes start with, beside zeros. */
+static void begin_pixels(Task *task, Lanes *lanes, int n, int64_t first, int count) {
+  clear_rays(task->sums, 8, task->count, first, count);
+  if (task->status) memset(task->status + first, 0, count * sizeof(int32_t));
+  if (!task->where) return;
+  memset(task->where + first, -1, count * sizeof(int32_t));
+  memset(task->where + task->count + first, 0, count * sizeof(int32_t));
+  begin_whole(lanes, n);
 }
 
 static void render_block(void *data, int k) {
@@ -129,12 +166,11 @@ static void render_block(void *data, int k) {
   int count = rays_in(task, first);
   Block *block = new_block(task);
   if (!block) return;
-  clear_rays(task->sums, 8, task->count, first, count);
-  memset(task->status + first, 0, count * sizeof(int32_t));
   fill_block(world, block, first, count, ROWS);
+  begin_pixels(task, &block->lanes, block->n, first, count);
   while (goes_on(world, block)) {
     arrive(&world->mesh, &block->lanes, block->n);
-    shade(&optics->transfer, &optics->rule, &block->lanes, block->n);
+    composite_segments(optics, &block->lanes, block->n);
     leave(&world->mesh, &block->lanes, block->n);
     settle(world, block, ROWS, optics->enough, keep_sums, task);
   }
@@ -149,11 +185,11 @@ static void shade_block(void *data, int k) {
   Block *block = new_block(task);
   if (!block) return;
   Lanes *lanes = &block->lanes;
-  clear_rays(task->sums, 8, task->count, first, count);
   int n = fill_runs(&task->nodes, lanes, first, count, ROWS);
+  begin_pixels(task, lanes, n, first, count);
   while (n > 0 && !is_over(&task->watch)) {
     play(&task->nodes, lanes, n);
-    shade(&optics->transfer, &optics->rule, lanes, n);
+    composite_segments(optics, lanes, n);
     n = settle_runs(lanes, n, ROWS, optics->enough, keep_sums, task);
   }
   free(block);
@@ -167,7 +203,7 @@ static void load_pixels(const Task *task, Lanes *lanes, int n) {
     int64_t r = lanes->integer[RAY][i];
     for (int k = 0; k < 8; k++) lanes->row[FINAL + k][i] = task->finals[k * task->count + r];
     for (int k = 0; k < 4; k++) lanes->row[PIXEL + k][i] = task->pixel_bar[k * task->count + r];
-    lanes->row[PIXEL + 3][i] *= exp_minus(lanes->row[FINAL][i], lanes->row[FINAL + 4][i]);
+    if (task->goal) lanes->integer[WHERE][i] = task->goal[r], lanes->integer[SLAB][i] = 0;
   }
 }
 
@@ -202,7 +238,7 @@ static void pull_block(Worker *worker, int64_t first) {
   while (goes_on(world, block)) {
     int n = block->n;
     arrive(&world->mesh, lanes, n);
-    pull_shading(&optics->transfer, &optics->rule, lanes, n, share->table);
+    pull_segments(optics, lanes, n, share->table);
     if (share->vertices.sum || task->rays_bar) pull_cells(lanes, n, worker->bar);
     if (share->vertices.sum)
       scatter_cells(&world->mesh, lanes, n, worker->bar, &share->vertices, &share->values);
@@ -221,7 +257,7 @@ static void pull_run_block(Worker *worker, int64_t first) {
   load_pixels(task, lanes, n);
   while (n > 0 && !is_over(&task->watch)) {
     play(&task->nodes, lanes, n);
-    pull_shading(&optics->transfer, &optics->rule, lanes, n, worker->share->table);
+    pull_segments(optics, lanes, n, worker->share->table);
     scatter_nodes(lanes, n, task->scalar, task->length);
     n = settle_runs(lanes, n, ALL_ROWS, optics->enough, keep_bars, worker);
   }
@@ -336,6 +372,7 @@ static void mark_broken(Task *task) {
   if (!atomic_load(&task->watch.broken)) return;
   for (int64_t r = 0; r < task->count; r++) task->status[r] = STATUS_BROKEN;
   if (task->sums) memset(task->sums, 0, 8 * task->count * sizeof(real));
+  if (task->where) memset(task->where, -1, task->count * sizeof(int32_t));
   if (task->number) memset(task->number, 0, task->count * sizeof(int32_t));
 }
 
@@ -386,6 +423,7 @@ EXPORT Failure jaxvr_render(XLA_FFI_CallFrame *frame) {
   Task task = {.world = world_of(frame), .optics = optics_of(frame, 10),
                .sums = result(frame, 0), .status = result(frame, 1)};
   task.count = task.world.rays.count;
+  task.where = size_of(frame, 2) ? result(frame, 2) : NULL;
   Failure failure = run(frame, blocks_of(task.count), render_block, &task);
   mark_broken(&task);
   return failure;
@@ -395,6 +433,7 @@ EXPORT Failure jaxvr_shade(XLA_FFI_CallFrame *frame) {
   if (asks_metadata(frame)) return NULL;
   Task task = {.nodes = nodes_of(frame), .optics = optics_of(frame, 4),
                .count = extent(frame, 2, 0), .sums = result(frame, 0)};
+  task.where = size_of(frame, 1) ? result(frame, 1) : NULL;
   return run_or_fail(frame, blocks_of(task.count), shade_block, &task);
 }
 
@@ -408,6 +447,7 @@ EXPORT Failure jaxvr_render_pull(XLA_FFI_CallFrame *frame) {
                .values_size = size_of(frame, 2)};
   task.count = task.world.rays.count;
   task.rays_bar = size_of(frame, 3) ? result(frame, 3) : NULL;
+  task.goal = extent(frame, 17, 0) ? argument(frame, 17) : NULL;
   memset(task.vertices_bar, 0, task.vertices_size * sizeof(real));
   memset(task.values_bar, 0, task.values_size * sizeof(real));
   return pull(frame, &task);
@@ -419,6 +459,7 @@ EXPORT Failure jaxvr_shade_pull(XLA_FFI_CallFrame *frame) {
   Task task = {.nodes = nodes_of(frame), .optics = optics_of(frame, 4),
                .count = extent(frame, 2, 0), .finals = argument(frame, 9),
                .pixel_bar = argument(frame, 10), .table_size = size_of(frame, 0)};
+  task.goal = extent(frame, 11, 0) ? argument(frame, 11) : NULL;
   int64_t scalars = size_of(frame, 1), lengths = size_of(frame, 2);
   task.scalar = scalars ? memset(result(frame, 1), 0, scalars * sizeof(real)) : NULL;
   task.length = lengths ? memset(result(frame, 2), 0, lengths * sizeof(real)) : NULL;

@@ -32,10 +32,11 @@ enum {
 enum { A = FACE, B = FACE + VERTEX, C = FACE + 2 * VERTEX };
 /* Rows of integers. REACHED, CUT_AT: where LEAD or CUT is not 0, the word of the face where the
  * depth was reached. BEHIND: bit 0 whether the segment starts behind the eye, bit 1 whether it ends
- * there, see make_segment of trace/local.py. FRESH: the segment does not start where the one before has ended, in scalar. */
+ * there, see make_segment of trace/local.py. FRESH: the segment does not start where the one before
+ * has ended, in scalar. WHERE: of the largest scalar, see whole.h. */
 enum {
   RAY, AXES, WORD = AXES + 3, POINT, POSITIVE, DROP, REACHED, CUT_AT, BEHIND, SLAB, FRESH, NEXT, END, LOST,
-  SLOT, INTEGERS
+  SLOT, WHERE, INTEGERS
 };
 
 /* leads: whether any LEAD may not be 0; cuts: whether CUT has been written for these segments. */

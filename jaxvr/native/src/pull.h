@@ -21,7 +21,7 @@ INLINE void pull_pieces(Lanes *lanes, const Pieces *p, int m, const int dense) {
     add_to(&sum, &excess, (real)0.5 * (a + b));
     lanes->row[SUMS][i] = sum;
     lanes->row[SUMS + 4][i] = excess;
-    /* PIXEL + 3 holds the cotangent of alpha times the final transmittance. */
+    /* PIXEL + 3 holds the cotangent of the optical depth. */
     real depth_bar = lanes->row[PIXEL + 3][i], w_bar = 0, w_back_bar = 0;
     real front_bar[4], back_bar[4];
     for (int c = 1; c < 4; c++) {

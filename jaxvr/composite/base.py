@@ -1,0 +1,127 @@
+"""What a compositor is: it folds the pieces along a ray into a pixel.
+
+Of a ray's pieces p_1, p_2, ... a compositor makes states by `add`, and RGBA of the last by
+`finish`. It never sees the volume or the ray, so that any of them works with any tracer and any
+integrator. To add one, write a frozen dataclass without arrays that derives from
+`AbstractCompositor`, in a file of its own; `composite.xray` is the shortest.
+
+Gradients: `finish` is differentiated by JAX. So is `add` in forward mode and by the recording
+adjoint; the replaying one, which stores nothing along the ray, asks `pull_back` for the cotangents
+of each piece, from the states on both sides of it and the last one.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxvr.optics.integrator import AbstractIntegrator
+from jaxvr.optics.partition import Segment
+from jaxvr.optics.transfer import TransferFunction
+
+Array = jax.Array
+
+
+class Piece(NamedTuple):
+    """A part of a segment, of each of R rays.
+
+    rgb (3, R): premultiplied colour. optical_depth (R,). Both are 0 of rays without a segment.
+    segment: that which it is a part of. last (R,) bool: the ray has a segment, and this is its last
+    piece: what sees segments as a whole looks at them then, once for each.
+
+    As a cotangent, from `AbstractCompositor.pull_back`: None for what a compositor does not see,
+    and for `last`.
+    """
+
+    rgb: Any
+    optical_depth: Any
+    segment: Any
+    last: Any
+
+
+class Scale(NamedTuple):
+    """Of the numbers that pieces have: lengths are the world's times `length` (), scalars the
+    world's less `offset` times `scalar` (): powers of two, see `jaxvr.units`."""
+
+    scalar: Array
+    length: Array
+    offset: float
+
+
+class AbstractCompositor(abc.ABC):
+    """States are pytrees with arrays (..., R) over R rays.
+
+    backwards: whether pieces are to be added farthest first.
+    """
+
+    @property
+    def backwards(self) -> bool:
+        return False
+
+    @property
+    @abc.abstractmethod
+    def needs(self) -> frozenset[str]:
+        """What of a piece it sees: "rgb", "optical_depth", "scalar" (the ends and the length of its
+        segment); and "transfer" where `finish` sees the transfer function."""
+
+    @property
+    def shades(self) -> bool:
+        """Whether it sees what an integrator makes of segments."""
+        return bool(self.needs & {"rgb", "optical_depth"})
+
+    @abc.abstractmethod
+    def default_integrator(self) -> AbstractIntegrator:
+        """The one that serves where the user names none."""
+
+    @abc.abstractmethod
+    def init(self, rays: int, dtype: Any) -> Any:
+        """The state of R `rays` before their first piece, with floats of this dtype."""
+
+    @abc.abstractmethod
+    def add(self, state: Any, piece: Piece) -> Any:
+        """The state with one more piece of each ray."""
+
+    def done(self, state: Any) -> Array | None:
+        """Rays (R,) that need none of the pieces to come; None if there never are any. They stop at
+        the end of their segment."""
+        return None
+
+    @abc.abstractmethod
+    def finish(self, state: Any, transfer: TransferFunction, scale: Scale) -> Array:
+        """Premultiplied RGBA (4, R); differentiable in all that is a float.
+
+        transfer: with positions in the scalars of the pieces.
+        """
+
+    @abc.abstractmethod
+    def merge(self, front: Any, back: Any) -> Any:
+        """The state of the pieces of `front` with those of `back` behind them: associative, and
+        equal to that of all pieces in turn to rounding."""
+
+    def pull_back(self, piece: Piece, before: Any, after: Any, final: Any, cotangent: Any) -> Piece:
+        """Cotangents of a piece.
+
+        Args:
+          before, after: states without it and with it. final: that of the whole ray, from a walk
+            that may have rounded in another way: floats of the two are not to be compared.
+          cotangent: of `final`, with None in place of integers.
+
+        Here for states that are sums, whose cotangent is the same all along the ray: that of `add`.
+        """
+        def floats(rgb, optical_depth, segment):
+            state = self.add(before, Piece(rgb, optical_depth, segment, piece.last))
+            return [x for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
+
+        pulled = jax.vjp(floats, *piece[:3])[1](jax.tree.leaves(cotangent))
+        asked = ("rgb", "optical_depth", "scalar")
+        return Piece(*(x if a in self.needs else None for a, x in zip(asked, pulled)), None)
+
+
+def seen(piece: Piece) -> Array:
+    """Segments (R,) that are whole now and are in sight: those of no length are behind the eye, or
+    no more than a face."""
+    return piece.last & (piece.segment.length > 0)
+
