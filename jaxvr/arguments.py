@@ -95,10 +95,11 @@ def transfer_of(
         well.
     """
     blind = compositor is not None and not (compositor.shades or "transfer" in compositor.needs)
-    if transfer is not None or not blind:
-        require_kind("transfer", transfer, TransferFunction)
     if blind:
+        if transfer is not None:
+            require_kind("transfer", transfer, TransferFunction)
         return TransferFunction([0.0], [[0.0] * 3], [0.0], dtype=dtype_of(volume))
+    require_kind("transfer", transfer, TransferFunction)
     # Its numbers may have been computed with since it was made: the same checks once more.
     transfer = TransferFunction(
         transfer.positions, transfer.colors, transfer.extinctions, offset=transfer.offset
@@ -137,8 +138,8 @@ def integrator_of(
     integrator = _noun("integrator", integrator, "slab", Analytic, default)
     if compositor is not None and compositor.shades and isinstance(integrator, Unshaded):
         raise ValueError(
-            f"{type(compositor).__name__} composites light, and Unshaded() gives none: take another "
-            "integrator, or leave it out."
+            f"{type(compositor).__name__} composites light, and Unshaded() gives none: take "
+            "another integrator, or leave it out."
         )
     return integrator
 

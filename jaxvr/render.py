@@ -375,7 +375,9 @@ def _how(pipeline: Pipeline, adjoint: Any, budget: Any, volume: Any) -> tuple[An
 
 
 def _pipeline(
-    tracer: AbstractTracer, integrator: AbstractIntegrator | None, compositor: AbstractCompositor | None
+    tracer: AbstractTracer,
+    integrator: AbstractIntegrator | None,
+    compositor: AbstractCompositor | None,
 ) -> Pipeline:
     """With what the compositor needs: segments from behind, if it goes back to front."""
     integrator, compositor = integrator_of(integrator), compositor_of(compositor)
@@ -397,7 +399,9 @@ def _render(pipeline, adjoint, size, volume, camera, transfer, offset, backgroun
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _render_rays(pipeline, adjoint, size, volume, origins, directions, transfer, offset, background):
+def _render_rays(
+    pipeline, adjoint, size, volume, origins, directions, transfer, offset, background
+):
     shape = origins.shape[:-1]
     volume, origins, directions = lax.optimization_barrier((volume, origins, directions))
     rays = (origins.reshape(-1, 3), directions.reshape(-1, 3))

@@ -40,7 +40,10 @@ MORE = {
         "jaxvr.optics.integrator.AbstractSlabIntegrator",
     ),
     "Tracers and orders": ("jaxvr.trace.base.AbstractTracer", "jaxvr.trace.recorded.Recorded"),
-    "Compositors and adjoints": ("jaxvr.adjoint.base.AbstractAdjoint",),
+    "Compositors and adjoints": (
+        "jaxvr.composite.base.AbstractCompositor",
+        "jaxvr.adjoint.base.AbstractAdjoint",
+    ),
     "Notebooks": ("jaxvr.interact.widget.Explorer",),
 }
 

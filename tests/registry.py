@@ -86,6 +86,9 @@ COMPOSITORS = [
     Entry("Over", jaxvr.Over),
     Entry("ending", lambda: jaxvr.Over(termination=0.5), 0.5, variant=True),
     Entry("backwards", lambda: jaxvr.Over(direction="back to front"), variant=True),
+    Entry("MaximumIntensity", jaxvr.MaximumIntensity),
+    Entry("XRay", jaxvr.XRay),
+    Entry("depths", lambda: jaxvr.XRay("optical depth"), variant=True),
 ]
 
 

@@ -80,7 +80,7 @@ PUBLIC = """
 TetMesh read_mesh write_mesh read_plot3d Camera TransferFunction render render_rays trace
 shade fit psnr ssim datasets Analytic PartialPreIntegration PreIntegration Quadrature AverageColor
 ConstantExtinction RayCast KBuffer measure_k rasterize refine order Over Replay Direct Forward check
-probe default_transfer save_image turntable explore
+probe default_transfer save_image turntable explore MaximumIntensity XRay
 """.split()
 
 

@@ -23,7 +23,7 @@ import jaxvr.accessors  # which PyVista finds by itself where jaxvr is installed
 import jaxvr.plot
 from jaxvr import cli
 from jaxvr.adjoint.base import AbstractAdjoint
-from jaxvr.composite import Over
+from jaxvr.composite import AbstractCompositor
 from jaxvr.optics import AbstractIntegrator
 from jaxvr.order import AbstractOrder
 from jaxvr.trace.base import AbstractTracer
@@ -189,7 +189,7 @@ def resolve(dotted: str):
 
 PUBLIC = sorted({name for names in public().values() for name in names})
 # What renderers call, and users do not: bases describe the arguments, by their shapes.
-SWAPPED = (AbstractTracer, AbstractIntegrator, AbstractAdjoint, AbstractOrder, Over)
+SWAPPED = (AbstractTracer, AbstractIntegrator, AbstractAdjoint, AbstractOrder, AbstractCompositor)
 
 
 @pytest.mark.parametrize("dotted", PUBLIC)

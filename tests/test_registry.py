@@ -212,3 +212,12 @@ def test_float32_follows_float64(location):
     want, _ = derivative("RayCast", "Analytic", "Direct", location, True)
     # Camera, points and field are rounded too: this is not the error of the renderer.
     assert np.max(np.abs(np.asarray(image) - want)) < 2e-5
+
+
+@pytest.mark.parametrize("compositor", ["MaximumIntensity", "XRay", "depths"])
+@pytest.mark.parametrize("adjoint", registry.ADJOINTS, ids=lambda x: x.name)
+def test_all_adjoints_with_all_compositors(compositor, adjoint):
+    (image, slopes), same = (shaded("Analytic", a, compositor) for a in (adjoint.name, "Direct"))
+    assert np.isfinite(image).all() and np.abs(image[..., 0]).max() > 0.1
+    assert np.allclose(image, same[0], atol=1e-12)
+    assert slopes == pytest.approx(same[1], rel=1e-9, abs=1e-13)

@@ -19,8 +19,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxvr.optics.integrator import AbstractIntegrator
-from jaxvr.optics.partition import Segment
-from jaxvr.optics.transfer import TransferFunction
 
 Array = jax.Array
 
@@ -44,11 +42,12 @@ class Piece(NamedTuple):
 
 class Scale(NamedTuple):
     """Of the numbers that pieces have: lengths are the world's times `length` (), scalars the
-    world's less `offset` times `scalar` (): powers of two, see `jaxvr.units`."""
+    world's less `offset` (), or less nothing if that is None, times `scalar` (). The two are powers
+    of two, see `jaxvr.units`."""
 
     scalar: Array
     length: Array
-    offset: float
+    offset: Array | None
 
 
 class AbstractCompositor(abc.ABC):
@@ -90,10 +89,11 @@ class AbstractCompositor(abc.ABC):
         return None
 
     @abc.abstractmethod
-    def finish(self, state: Any, transfer: TransferFunction, scale: Scale) -> Array:
+    def finish(self, state: Any, transfer: Any, scale: Any) -> Array:
         """Premultiplied RGBA (4, R); differentiable in all that is a float.
 
-        transfer: with positions in the scalars of the pieces.
+        transfer: a `TransferFunction` with positions in the scalars of the pieces; scale: a
+        `Scale`. What does not look at them may be given None.
         """
 
     @abc.abstractmethod
@@ -111,17 +111,20 @@ class AbstractCompositor(abc.ABC):
 
         Here for states that are sums, whose cotangent is the same all along the ray: that of `add`.
         """
+
         def floats(rgb, optical_depth, segment):
             state = self.add(before, Piece(rgb, optical_depth, segment, piece.last))
             return [x for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
 
         pulled = jax.vjp(floats, *piece[:3])[1](jax.tree.leaves(cotangent))
-        asked = ("rgb", "optical_depth", "scalar")
-        return Piece(*(x if a in self.needs else None for a, x in zip(asked, pulled)), None)
+        rgb, optical_depth, segment = (
+            bar if name in self.needs else None
+            for name, bar in zip(("rgb", "optical_depth", "scalar"), pulled, strict=True)
+        )
+        return Piece(rgb, optical_depth, segment, None)
 
 
 def seen(piece: Piece) -> Array:
     """Segments (R,) that are whole now and are in sight: those of no length are behind the eye, or
     no more than a face."""
     return piece.last & (piece.segment.length > 0)
-

@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 
-from jaxvr.composite.base import AbstractCompositor, Scale, seen
+from jaxvr.composite.base import AbstractCompositor, seen
 from jaxvr.numerics import compensated
 from jaxvr.numerics.compensated import Sum
 from jaxvr.optics.analytic import Analytic
@@ -84,11 +84,11 @@ class XRay(AbstractCompositor):
             compensated.add(state.integral, more), compensated.add(state.length, length)
         )
 
-    def finish(self, state, transfer, scale: Scale):
+    def finish(self, state, transfer, scale):
         integral, length = (compensated.value(x) for x in state)
         if self.of == "scalar":
             integral = integral / scale.scalar / scale.length
-            if scale.offset:
+            if scale.offset is not None:
                 integral = integral + scale.offset * (length / scale.length)
         hit = jnp.where(jax.lax.stop_gradient(length) > 0, 1, 0).astype(integral.dtype)
         return jnp.stack([integral, integral, integral, hit])
@@ -99,4 +99,3 @@ class XRay(AbstractCompositor):
             return total, excess + b[1]
 
         return XRayState(both(front.integral, back.integral), both(front.length, back.length))
-

@@ -31,7 +31,6 @@ from jaxvr.optics.unshaded import Unshaded
 from jaxvr.trace.raycast import RayCast
 from jaxvr.trace.recorded import Recorded
 
-
 _WRITTEN = (RayCast, Recorded, Analytic, Unshaded, Over, MaximumIntensity, XRay)
 
 

@@ -62,7 +62,7 @@ def test_image_is_within_the_bound(how, termination, dtype):
 
 
 def test_zero_is_off_and_the_smallest_number_changes_no_bit():
-    assert Over().ended(Over().start(3, jnp.float32)) is None
+    assert Over().done(Over().init(3, jnp.float32)) is None
     assert Over() == Over(0.0)
     for how in ("render", "shade"):
         assert np.array_equal(image_of(0.0, "float64", how), image_of(1e-300, "float64", how))
@@ -128,25 +128,17 @@ class Witness:
     over: Over
     seen: list = dataclasses.field(default_factory=list, compare=False)
     backwards = False
+    shades = True
 
-    def start(self, rays, dtype):
-        return self.over.start(rays, dtype)
+    def __getattr__(self, name):
+        return getattr(self.over, name)
 
-    def add(self, state, rgb, depth):
-        return self.over.add(state, rgb, depth)
-
-    def ended(self, state):
-        return self.over.ended(state)
-
-    def finish(self, state):
-        return self.over.finish(state)
-
-    def pull_back(self, before, after, final, cotangent):
+    def pull_back(self, piece, before, after, final, cotangent):
         jax.debug.callback(
             lambda *x: self.seen.append([np.asarray(a) for a in x]),
-            *(compensated.value(after.depth), compensated.value(final.depth), self.ended(final)),
+            *(compensated.value(after.depth), compensated.value(final.depth), self.done(final)),
         )
-        return self.over.pull_back(before, after, final, cotangent)
+        return self.over.pull_back(piece, before, after, final, cotangent)
 
 
 def test_the_replay_ends_rays_where_they_ended(dtype):

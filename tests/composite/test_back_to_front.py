@@ -15,19 +15,9 @@ import jaxvr
 from jaxvr import native
 from jaxvr.composite import Over
 from jaxvr.trace import Recorded
-from tests.composite.test_over import pieces
+from tests.composite.test_over import fold, pieces, pixels, require_derivative
 
 BEHIND = Over(direction="back to front")
-
-
-def fold(rgb, depth):
-    """Pieces (N, 3, R) and (N, R), listed front to back, composited from behind."""
-
-    def body(state, piece):
-        return BEHIND.add(state, *piece), None
-
-    start = BEHIND.start(depth.shape[1], depth.dtype)
-    return jax.lax.scan(body, start, (rgb, depth), reverse=True)[0]
 
 
 @pytest.mark.parametrize("size", [1e-8, 1e-3, 0.05, 0.7, 5.0])
@@ -35,7 +25,7 @@ def test_float32_keeps_its_digits_from_thin_to_opaque(size):
     rgb, depth = pieces(size, n=2000)
     before = np.cumsum(depth, 0, dtype=np.float64) - depth
     want = (np.exp(-before)[:, None] * rgb).sum(0)
-    got = np.asarray(BEHIND.finish(fold(rgb, depth)))
+    got = np.asarray(pixels(fold(rgb, depth, BEHIND), BEHIND))
     assert np.max(np.abs(got[:3] / want - 1)) < 1e-6
     assert np.max(np.abs(got[3] / -np.expm1(-depth.sum(0, dtype=np.float64)) - 1)) < 5e-7
 
@@ -44,7 +34,8 @@ def test_what_an_opaque_piece_hides_leaves_no_rounding():
     """A light of 1e6 behind an optical depth of 16: 0.1125, where float32 subtracts 1e6 - 1e6."""
     depth = jnp.asarray([[16.0], [1.0]], jnp.float32)
     rgb = jnp.asarray([[[0.0]] * 3, [[1e6]] * 3], jnp.float32)
-    assert np.allclose(BEHIND.finish(fold(rgb, depth))[:3], 1e6 * np.exp(-16), rtol=1e-6)
+    got = pixels(fold(rgb, depth, BEHIND), BEHIND)
+    assert np.allclose(got[:3], 1e6 * np.exp(-16), rtol=1e-6)
 
 
 @pytest.mark.parametrize("opaque", [None, 1e4])
@@ -53,19 +44,7 @@ def test_pull_back_is_the_derivative_even_behind_an_opaque_piece(opaque):
     depth[8] = 1.5
     if opaque:
         depth[5] = opaque
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=(4, 4)))
-
-    def loss(rgb, depth):
-        return jnp.sum(weights * BEHIND.finish(fold(rgb, depth)))
-
-    want = jax.grad(loss, argnums=(0, 1))(rgb, depth)
-    final, before = fold(rgb, depth), BEHIND.start(4, np.float64)
-    for i in reversed(range(12)):
-        after = BEHIND.add(before, jnp.asarray(rgb[i]), jnp.asarray(depth[i]))
-        rgb_bar, depth_bar = BEHIND.pull_back(before, after, final, weights)
-        assert np.allclose(rgb_bar, want[0][i], atol=1e-15)
-        assert np.allclose(depth_bar, want[1][i], atol=1e-14)
-        before = after
+    require_derivative(rgb, depth, BEHIND)
 
 
 def test_float32_and_opaque_cells_have_the_image_and_the_gradient_of_front_to_back():

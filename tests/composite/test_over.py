@@ -9,18 +9,49 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvr.composite import Over
+from jaxvr.composite import Over, Piece
+from jaxvr.composite.over import OverState
+
+OVER = Over()
 
 
-def fold(rgb, depth):
-    """Pieces (N, 3, R) and (N, R) composited front to back."""
-    over = Over()
+def piece(rgb, depth) -> Piece:
+    """Light alone: `Over` sees nothing else."""
+    return Piece(jnp.asarray(rgb), jnp.asarray(depth), None, None)
 
-    def body(state, piece):
-        return over.add(state, *piece), None
 
-    state, _ = jax.lax.scan(body, over.start(depth.shape[1], depth.dtype), (rgb, depth))
-    return state
+def fold(rgb, depth, over=OVER):
+    """Pieces (N, 3, R) and (N, R), listed front to back, composited in that order or from
+    behind."""
+
+    def body(state, light):
+        return over.add(state, piece(*light)), None
+
+    start = over.init(depth.shape[1], depth.dtype)
+    return jax.lax.scan(body, start, (rgb, depth), reverse=over.backwards)[0]
+
+
+def pixels(state, over=OVER):
+    return over.finish(state, None, None)
+
+
+def require_derivative(rgb, depth, over):
+    """`pull_back`, piece by piece, against the derivative of the whole by JAX."""
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=(4, 4)))
+
+    def loss(rgb, depth):
+        return jnp.sum(weights * pixels(fold(rgb, depth, over), over))
+
+    want = jax.grad(loss, argnums=(0, 1))(rgb, depth)
+    final, before = fold(rgb, depth, over), over.init(4, np.float64)
+    bar: OverState = jax.grad(lambda s: jnp.sum(weights * pixels(s, over)))(final)
+    for i in sorted(range(len(depth)), reverse=over.backwards):
+        this = piece(rgb[i], depth[i])
+        after = over.add(before, this)
+        found = over.pull_back(this, before, after, final, bar)
+        assert np.allclose(found.rgb, want[0][i], atol=1e-15)
+        assert np.allclose(found.optical_depth, want[1][i], atol=1e-14)
+        before = after
 
 
 def pieces(size, n=200, dtype: Any = np.float32):
@@ -35,7 +66,7 @@ def test_float32_keeps_its_digits_from_thin_to_opaque(size):
     rgb, depth = pieces(size)
     before = np.cumsum(depth, 0, dtype=np.float64) - depth
     want = (np.exp(-before)[:, None] * rgb).sum(0)
-    got = np.asarray(Over().finish(fold(rgb, depth)))
+    got = np.asarray(pixels(fold(rgb, depth)))
     assert np.max(np.abs(got[:3] / want - 1)) < 1e-6
     assert np.max(np.abs(got[3] / -np.expm1(-depth.sum(0, dtype=np.float64)) - 1)) < 5e-7
 
@@ -45,17 +76,4 @@ def test_pull_back_is_the_derivative_even_behind_an_opaque_piece(opaque):
     rgb, depth = pieces(0.2, n=12, dtype=np.float64)
     if opaque:
         depth[5] = opaque
-    over = Over()
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=(4, 4)))
-
-    def loss(rgb, depth):
-        return jnp.sum(weights * over.finish(fold(rgb, depth)))
-
-    want = jax.grad(loss, argnums=(0, 1))(rgb, depth)
-    final, before = fold(rgb, depth), over.start(4, np.float64)
-    for i in range(12):
-        after = over.add(before, jnp.asarray(rgb[i]), jnp.asarray(depth[i]))
-        rgb_bar, depth_bar = over.pull_back(before, after, final, weights)
-        assert np.allclose(rgb_bar, want[0][i], atol=1e-15)
-        assert np.allclose(depth_bar, want[1][i], atol=1e-14)
-        before = after
+    require_derivative(rgb, depth, OVER)

@@ -1,0 +1,279 @@
+"""`XRay` and `MaximumIntensity`: against brute force, in both engines, with gradients; and what all
+compositors promise: that what was cut can be merged. All adjoints are in test_registry."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import quick
+import registry
+
+import jaxvr
+from jaxvr import MaximumIntensity, Over, XRay
+from jaxvr.adjoint import Pipeline, replay
+from jaxvr.adjoint.base import Operands
+from jaxvr.composite import Piece
+from jaxvr.optics import Segment
+from jaxvr.testing import BruteForce, assert_gradients
+from jaxvr.trace import RayCast
+from jaxvr.volume import datasets
+
+EPS = {"float32": 1.2e-7, "float64": 2.3e-16}
+ENGINES = [False, True]
+
+
+def brute(mesh, origins, directions):
+    """Integral, length and largest scalar of rays (R, 3), chord by chord; NaN of rays that miss."""
+    pieces = BruteForce(mesh).pieces(origins, directions)
+    length = (pieces.leave - pieces.enter).astype(np.float64)
+    mean = (pieces.front + pieces.back).astype(np.float64) / 2
+    count = len(origins)
+    integral = np.bincount(pieces.ray, length * mean, count)
+    chord = np.bincount(pieces.ray, length, count)
+    largest = np.full(count, -np.inf)
+    np.maximum.at(largest, pieces.ray, np.maximum(pieces.front, pieces.back).astype(np.float64))
+    return integral, chord, largest
+
+
+def ramp(low, high, dtype="float64"):
+    """Of which red is the scalar itself, from 0 to 1."""
+    colors = np.array([[0.0, 1.0, 0.2], [1.0, 0.0, 0.2]])
+    return jaxvr.TransferFunction([low, high], colors, [0.0, 0.0], dtype=dtype)
+
+
+@pytest.mark.parametrize("native", ENGINES)
+@pytest.mark.parametrize("location", registry.MESHES)
+def test_against_brute_force(location, native, dtype):
+    mesh, camera = registry.mesh_of(location, dtype), registry.camera_of(dtype)
+    origins, directions = (np.asarray(x).reshape(-1, 3) for x in camera.rays())
+    integral, chord, largest = brute(mesh, origins, directions)
+    hit = chord > 0
+    assert 8 <= hit.sum() < 30
+    adjoint = jaxvr.Replay(native=native)
+    low, high = float(mesh.values.min()), float(mesh.values.max())
+
+    def seen(compositor, transfer):
+        image = jaxvr.render(mesh, camera, transfer, compositor=compositor, adjoint=adjoint)
+        assert image.dtype == mesh.dtype
+        return np.asarray(image, np.float64).reshape(-1, 4)
+
+    small = 40 * EPS[dtype]
+    got = seen(XRay(), None)
+    assert np.max(np.abs(got[:, :3] - integral[:, None])) < small
+    assert np.array_equal(got[:, 3], hit)
+    # An extinction that is the scalar itself.
+    itself = jaxvr.TransferFunction([0.0, 1.0], np.ones((2, 3)), [0.0, 1.0], dtype=dtype)
+    assert 0 <= low < high <= 1
+    depth = seen(XRay("optical depth"), itself)
+    assert np.max(np.abs(depth[:, 0] - integral)) < small
+    assert np.array_equal(depth[:, 3], hit)
+    got = seen(MaximumIntensity(), ramp(low, high, dtype))
+    want = np.where(hit, (largest - low) / (high - low), 0)
+    assert np.max(np.abs(got[:, 0] - want)) < small
+    assert np.array_equal(got[:, 3], hit)
+    assert np.all(got[hit, 2] == np.float64(np.asarray(0.2, dtype)))
+
+
+@pytest.mark.parametrize("native", ENGINES)
+@pytest.mark.parametrize("compositor", [XRay(), XRay("optical depth"), MaximumIntensity()])
+def test_gradients_by_differences(compositor, native):
+    mesh, camera = registry.mesh_of("corner", "float64"), registry.camera_of("float64")
+    adjoint = jaxvr.Replay(native=native)
+
+    def image(values, points, camera, transfer):
+        moved = mesh.replace(values=values, points=points)
+        return jaxvr.render(moved, camera, transfer, compositor=compositor, adjoint=adjoint)
+
+    operands = {"values": mesh.values, "points": mesh.points, "camera": camera}
+    smooth = jaxvr.TransferFunction(
+        [-0.5, 1.5], np.array([[0.1, 0.9, 0.4], [0.7, 0.2, 0.6]]), [0.3, 2.0], dtype="float64"
+    )
+    operands["transfer"] = smooth
+    if compositor == XRay():
+        operands.pop("transfer")
+
+        def blind(values, points, camera):
+            return image(values, points, camera, None)
+
+        assert_gradients(blind, operands, rtol=1e-7, step=1e-4, orders=1, forward=False)
+        return
+    assert_gradients(image, operands, rtol=1e-7, step=1e-4, orders=1, forward=False)
+
+
+@pytest.mark.parametrize("compositor", [XRay(), XRay("optical depth"), MaximumIntensity(), Over()])
+def test_replay_by_the_other_engine(compositor):
+    """The forward pass by one engine and the replay by the other, which rounds in its own way."""
+    mesh, camera = registry.mesh_of("corner", "float32"), registry.camera_of("float32")
+    transfer = registry.transfer_of("float32")
+    integrator = compositor.default_integrator()
+    pipeline = Pipeline(RayCast(), integrator, compositor)
+    scene = pipeline.tracer.prepare(mesh)
+    rays = pipeline.tracer.prepare_rays(scene, *(x.reshape(-1, 3) for x in camera.rays()))
+    rays = jax.tree.map(lambda x: x[None], rays)
+    table = integrator.prepare(transfer, jnp.float32, pipeline.tracer.longest(scene))
+    operands = Operands(scene, rays, table)
+    rng = np.random.default_rng(0)
+
+    def gradient(forward, backward, cotangent=None):
+        state, status = replay._run(pipeline, forward, operands)
+        assert not np.asarray(status).any()
+        if cotangent is None:
+            cotangent = jax.tree.map(
+                lambda x: (
+                    jnp.asarray(rng.normal(size=x.shape), x.dtype)
+                    if jnp.issubdtype(x.dtype, jnp.floating)
+                    else np.zeros(x.shape, jax.dtypes.float0)
+                ),
+                state,
+            )
+        leaves = jax.tree.leaves(operands)
+        asked = replay._flags([jnp.issubdtype(x.dtype, jnp.floating) for x in leaves])
+        found = replay._backward(pipeline, backward, (operands, state, asked), (cotangent, None))
+        mesh_bar = found[0].scene.mesh
+        return (mesh_bar.values, mesh_bar.coordinates), cotangent
+
+    want, cotangent = gradient(False, False)
+    for forward, backward in ((True, False), (False, True), (True, True)):
+        got, _ = gradient(forward, backward, cotangent)
+        for g, w in zip(got, want, strict=True):
+            assert np.max(np.abs(w)) > 0
+            assert np.max(np.abs(g - w)) < 2e-5 * np.max(np.abs(w))
+
+
+@pytest.mark.parametrize(
+    "compositor", [Over(), Over(direction="back to front"), XRay(), MaximumIntensity()]
+)
+def test_what_was_cut_can_be_merged(compositor, dtype):
+    """In two parts and in three, associated either way; of pieces that end segments or do not."""
+    rng = np.random.default_rng(3)
+    count, rays = 40, 64
+    depth = rng.uniform(0, 0.2, (count, rays))
+    rgb = rng.uniform(0, 1, (count, 3, rays)) * depth[:, None]
+    length = np.where(rng.uniform(size=(count, rays)) < 0.2, 0, rng.uniform(size=(count, rays)))
+    ends = rng.normal(size=(2, count, rays))
+    last = rng.uniform(size=(count, rays)) < 0.7
+
+    def fold(first, end):
+        state = compositor.init(rays, dtype)
+        order = range(first, end)
+        for i in reversed(order) if compositor.backwards else order:
+            numbers = (rgb[i], depth[i], ends[0, i], ends[1, i], length[i])
+            r, d, f, g, h = (jnp.asarray(x, dtype) for x in numbers)
+            state = compositor.add(state, Piece(r, d, Segment(f, g, h), jnp.asarray(last[i])))
+        return state
+
+    whole = fold(0, count)
+    a, b = sorted(rng.integers(0, count + 1, 2))
+    parts = fold(0, a), fold(a, b), fold(b, count)
+    merge = compositor.merge
+    for joined in (merge(merge(*parts[:2]), parts[2]), merge(parts[0], merge(*parts[1:]))):
+        for x, y in zip(jax.tree.leaves(joined), jax.tree.leaves(whole), strict=True):
+            if jnp.issubdtype(x.dtype, jnp.integer):
+                assert np.array_equal(x, y)
+            else:
+                assert np.max(np.abs(x - y)) <= 8 * EPS[dtype] * max(np.max(np.abs(y)), 1)
+
+
+def test_offsets_and_units_come_back():
+    """A field far from 0 in float32, and everything times powers of two."""
+    camera = registry.camera_of("float32")
+    near = registry.mesh_of("point", "float64")
+    values = 101325 + 0.01 * np.asarray(near.values)
+    far = jaxvr.TetMesh.from_cells(
+        np.asarray(near.points), {"tetra": np.asarray(near.cells)}, values, dtype="float32"
+    )
+    assert far.offset
+    exact = near.replace(values=values)
+    want = jaxvr.render(exact, registry.camera_of("float64"), None, compositor=XRay())
+    for native in ENGINES:
+        adjoint = jaxvr.Replay(native=native)
+        got = jaxvr.render(far, camera, None, compositor=XRay(), adjoint=adjoint)
+        assert np.max(np.abs(got / jnp.where(want == 0, 1, want) - (want != 0))) < 1e-6
+        transfer = ramp(101325.0, 101325.01)
+        red = jaxvr.render(far, camera, transfer, compositor=MaximumIntensity(), adjoint=adjoint)
+        same = jaxvr.render(
+            near.replace(values=values), camera, transfer, compositor=MaximumIntensity()
+        )
+        assert np.max(np.abs(red - same)) < 2e-5
+    mesh = registry.mesh_of("point", "float32")
+    plain = jaxvr.render(mesh, camera, None, compositor=XRay())
+    larger = mesh.replace(values=mesh.values * 2.0**70)
+    scaled = jaxvr.render(larger, camera, None, compositor=XRay())
+    assert np.array_equal(scaled[..., 0], plain[..., 0] * 2.0**70)
+
+
+def _render(mesh, camera, transfer, compositor):
+    return jaxvr.render(mesh, camera, transfer, compositor=compositor)
+
+
+def test_other_tracers_and_transforms(dtype):
+    mesh, camera = registry.mesh_of("point", dtype), registry.camera_of(dtype)
+    transfer = ramp(0.0, 1.0, dtype)
+    for compositor in (XRay(), MaximumIntensity()):
+        image = jaxvr.render(mesh, camera, transfer, compositor=compositor)
+        same = [
+            jaxvr.render(mesh, camera, transfer, compositor=compositor, tracer=jaxvr.KBuffer(8)),
+            jaxvr.shade(jaxvr.trace(mesh, camera), transfer, compositor=compositor),
+            jaxvr.render_rays(mesh, *camera.rays(), transfer, compositor=compositor),
+            quick.jit(_render, static_argnums=3)(mesh, camera, transfer, compositor),
+            # Cut at control points, the segments are the same.
+            jaxvr.render(
+                mesh, camera, transfer, compositor=compositor, integrator=jaxvr.AverageColor()
+            ),
+        ]
+        for other in same:
+            assert np.max(np.abs(other - image)) < 40 * EPS[dtype]
+
+
+def test_the_eye_inside_sees_what_is_ahead():
+    mesh = datasets.box((2, 2, 2), dtype="float64")
+    values = np.asarray(mesh.points)[:, 0]
+    mesh = mesh.replace(values=values)
+    origins, directions = np.full((1, 3), 0.53), np.array([[1.0, 0.0, 0.0]])
+    for sign, want in ((1.0, (1 - 0.53**2) / 2), (-1.0, 0.53**2 / 2)):
+        got = jaxvr.render_rays(mesh, origins, sign * directions, None, compositor=XRay())
+        assert np.allclose(got[0, 0], want, rtol=1e-14)
+        red = jaxvr.render_rays(
+            mesh, origins, sign * directions, ramp(0, 1), compositor=MaximumIntensity()
+        )
+        assert np.allclose(red[0, 0], 1.0 if sign > 0 else 0.53, rtol=1e-14)
+
+
+@pytest.mark.outside("bluntfin.vts")
+@pytest.mark.optimised
+def test_on_a_real_mesh(data_path):
+    mesh = jaxvr.read_mesh(data_path("bluntfin.vts"), "density", dtype="float64")
+    camera = jaxvr.Camera.orbit(mesh, width=20, height=15, dtype="float64")
+    integral, chord, largest = brute(mesh, *(np.asarray(x).reshape(-1, 3) for x in camera.rays()))
+    got = np.asarray(jaxvr.render(mesh, camera, None, compositor=XRay())).reshape(-1, 4)
+    assert (chord > 0).sum() > 40
+    assert np.max(np.abs(got[:, 0] - integral)) < 1e-13 * integral.max()
+    low, high = float(mesh.values.min()), float(mesh.values.max())
+    red = jaxvr.render(mesh, camera, ramp(low, high), compositor=MaximumIntensity())
+    want = np.where(chord > 0, (largest - low) / (high - low), 0)
+    assert np.max(np.abs(np.asarray(red)[..., 0].ravel() - want)) < 1e-14
+
+
+def test_what_cannot_be_is_said():
+    mesh, camera = registry.mesh_of("point", "float64"), registry.camera_of("float64")
+    transfer = registry.transfer_of("float64")
+    wrong: Any = "density"
+    with pytest.raises(ValueError, match=r"of must be one of \['scalar', 'optical depth'\]"):
+        XRay(wrong)
+    none: Any = None
+    for compositor in (Over(), MaximumIntensity(), XRay("optical depth")):
+        with pytest.raises(ValueError, match="transfer must be a TransferFunction"):
+            jaxvr.render(mesh, camera, none, compositor=compositor)
+    for compositor in (Over(), XRay("optical depth")):
+        unshaded = XRay().default_integrator()
+        with pytest.raises(ValueError, match="composites light, and Unshaded"):
+            jaxvr.render(mesh, camera, transfer, compositor=compositor, integrator=unshaded)
+    with pytest.raises(ValueError, match=r"XRay\(of='scalar'\) does not look at the transfer"):
+        jaxvr.fit(transfer, mesh, camera, np.zeros((5, 6, 4)), compositor=XRay())
+    away = jaxvr.Camera.look_at((3, 3, 3), (6, 6, 6), width=4, height=4)
+    with pytest.warns(jaxvr.ViewWarning, match="blank. The volume lies behind the camera"):
+        jaxvr.render(mesh, away, None, compositor=XRay())
