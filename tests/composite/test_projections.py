@@ -243,10 +243,10 @@ def test_the_eye_inside_sees_what_is_ahead():
         assert np.allclose(red[0, 0], 1.0 if sign > 0 else 0.53, rtol=1e-14)
 
 
-@pytest.mark.outside("bluntfin.vts")
+@pytest.mark.outside("bluntfin.vtu")
 @pytest.mark.optimised
 def test_on_a_real_mesh(data_path):
-    mesh = jaxvr.read_mesh(data_path("bluntfin.vts"), "density", dtype="float64")
+    mesh = jaxvr.read_mesh(data_path("bluntfin.vtu"), "density", dtype="float64")
     camera = jaxvr.Camera.orbit(mesh, width=20, height=15, dtype="float64")
     integral, chord, largest = brute(mesh, *(np.asarray(x).reshape(-1, 3) for x in camera.rays()))
     got = np.asarray(jaxvr.render(mesh, camera, None, compositor=XRay())).reshape(-1, 4)
