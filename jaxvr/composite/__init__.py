@@ -13,9 +13,17 @@ final state, so that nothing along the ray is stored.
 To add one: a file here, one line in the tests' registry.
 """
 
-from jaxvr.composite.base import AbstractCompositor, Piece, Scale
+from jaxvr.composite.base import AbstractCompositor, AbstractSum, Piece, Scale
 from jaxvr.composite.maximum_intensity import MaximumIntensity
 from jaxvr.composite.over import Over
 from jaxvr.composite.xray import XRay
 
-__all__ = ["AbstractCompositor", "MaximumIntensity", "Over", "Piece", "Scale", "XRay"]
+__all__ = [
+    "AbstractCompositor",
+    "AbstractSum",
+    "MaximumIntensity",
+    "Over",
+    "Piece",
+    "Scale",
+    "XRay",
+]

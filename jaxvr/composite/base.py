@@ -3,7 +3,7 @@
 Of a ray's pieces p_1, p_2, ... a compositor makes states by `add`, and RGBA of the last by
 `finish`. It never sees the volume or the ray, so that any of them works with any tracer and any
 integrator. To add one, write a frozen dataclass without arrays that derives from
-`AbstractCompositor`, in a file of its own; `composite.xray` is the shortest.
+`AbstractCompositor`, or from `AbstractSum`, in a file of its own; `composite.xray` is the shortest.
 
 Gradients: `finish` is differentiated by JAX. So is `add` in forward mode and by the recording
 adjoint; the replaying one, which stores nothing along the ray, asks `pull_back` for the cotangents
@@ -101,6 +101,7 @@ class AbstractCompositor(abc.ABC):
         """The state of the pieces of `front` with those of `back` behind them: associative, and
         equal to that of all pieces in turn to rounding."""
 
+    @abc.abstractmethod
     def pull_back(self, piece: Piece, before: Any, after: Any, final: Any, cotangent: Any) -> Piece:
         """Cotangents of a piece.
 
@@ -108,10 +109,14 @@ class AbstractCompositor(abc.ABC):
           before, after: states without it and with it. final: that of the whole ray, from a walk
             that may have rounded in another way: floats of the two are not to be compared.
           cotangent: of `final`, with None in place of integers.
-
-        Here for states that are sums, whose cotangent is the same all along the ray: that of `add`.
         """
 
+
+class AbstractSum(AbstractCompositor):
+    """One whose state is a sum of what pieces add by themselves, whatever the state is by then: its
+    cotangent is the same all along the ray, and `add` can be differentiated as it is."""
+
+    def pull_back(self, piece, before, after, final, cotangent):
         def floats(rgb, optical_depth, segment):
             state = self.add(before, Piece(rgb, optical_depth, segment, piece.last))
             return [x for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]

@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 
-from jaxvr.composite.base import AbstractCompositor, seen
+from jaxvr.composite.base import AbstractSum, seen
 from jaxvr.numerics import compensated
 from jaxvr.numerics.compensated import Sum
 from jaxvr.optics.analytic import Analytic
@@ -36,7 +36,7 @@ class XRayState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class XRay(AbstractCompositor):
+class XRay(AbstractSum):
     """The integral along each ray of the scalar or of the extinction.
 
     of: "scalar": the integral of the field over world length, in its units times a length; the

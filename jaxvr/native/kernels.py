@@ -70,6 +70,7 @@ def pull_back(
     operands = (*world, *_optics(pipeline, operands, dtype))
     operands = (*operands, *_finals(pipeline.compositor, final, cotangent))
     ask_scene, ask_rays, ask_table = asked
+    ask_table = ask_table and pipeline.compositor.shades
     rows = Shape((2 * table.position.shape[0] if ask_table else 0, PAIR), dtype)
 
     def sized(like: Array, wanted: bool) -> Shape:
