@@ -380,7 +380,8 @@ def _pipeline(
     compositor: AbstractCompositor | None,
 ) -> Pipeline:
     """With what the compositor needs: segments from behind, if it goes back to front."""
-    integrator, compositor = integrator_of(integrator), compositor_of(compositor)
+    compositor = compositor_of(compositor)
+    integrator = integrator_of(integrator, compositor)
     if compositor.backwards:
         tracer, integrator = tracer.reversed(), integrator.reversed()
     return Pipeline(tracer, integrator, compositor)

@@ -147,7 +147,7 @@ def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: An
     tracer, integrator = pipeline.tracer, pipeline.integrator
     structure = jax.tree.structure(operands)
     perturbed: Operands = jax.tree.unflatten(structure, [flag.shape[0] == 1 for flag in asked])
-    optical = any(jax.tree.leaves(perturbed.table))
+    optical = pipeline.compositor.shades and any(jax.tree.leaves(perturbed.table))
     # Where it is transparent, segments have no gradient, but the transfer function has.
     table = operands.table if optical else integrator.shorten(operands.table, False)
     if compiled:

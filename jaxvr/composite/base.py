@@ -51,13 +51,11 @@ class Scale(NamedTuple):
 
 
 class AbstractCompositor(abc.ABC):
-    """States are pytrees with arrays (..., R) over R rays.
-
-    backwards: whether pieces are to be added farthest first.
-    """
+    """States are pytrees with arrays (..., R) over R rays."""
 
     @property
     def backwards(self) -> bool:
+        """Whether pieces are to be added farthest first."""
         return False
 
     @property

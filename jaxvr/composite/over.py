@@ -106,6 +106,7 @@ class Over(AbstractCompositor):
 
     @property
     def backwards(self) -> bool:
+        """Whether pieces are to be added farthest first."""
         return self.direction == "back to front"
 
     @property

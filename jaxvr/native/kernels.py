@@ -70,7 +70,6 @@ def pull_back(
     operands = (*world, *_optics(pipeline, operands, dtype))
     operands = (*operands, *_finals(pipeline.compositor, final, cotangent))
     ask_scene, ask_rays, ask_table = asked
-    ask_table = ask_table and pipeline.compositor.shades
     rows = Shape((2 * table.position.shape[0] if ask_table else 0, PAIR), dtype)
 
     def sized(like: Array, wanted: bool) -> Shape:
@@ -172,7 +171,7 @@ def _finals(compositor: Any, final: Any, cotangent: Any) -> tuple[Array, Array, 
     sums = [integral, length, zero, zero, lost, missed, zero, zero]
     by_integral, by_length = cotangent.integral[0], cotangent.length[0]
     bars = [by_integral, by_length, zero, zero]
-    if compositor.shades:
+    if compositor.shades:  # the length has no derivative there, see `XRay.finish`
         bars = [zero, zero, zero, by_integral]
     return jnp.stack(sums), jnp.stack(bars), none
 

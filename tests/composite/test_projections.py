@@ -13,10 +13,11 @@ import quick
 import registry
 
 import jaxvr
-from jaxvr import MaximumIntensity, Over, XRay
+from jaxvr import MaximumIntensity, Over, XRay, native
 from jaxvr.adjoint import Pipeline, replay
 from jaxvr.adjoint.base import Operands
 from jaxvr.composite import Piece
+from jaxvr.numerics import compensated
 from jaxvr.optics import Segment
 from jaxvr.testing import BruteForce, assert_gradients
 from jaxvr.trace import RayCast
@@ -45,15 +46,15 @@ def ramp(low, high, dtype="float64"):
     return jaxvr.TransferFunction([low, high], colors, [0.0, 0.0], dtype=dtype)
 
 
-@pytest.mark.parametrize("native", ENGINES)
+@pytest.mark.parametrize("compiled", ENGINES)
 @pytest.mark.parametrize("location", registry.MESHES)
-def test_against_brute_force(location, native, dtype):
+def test_against_brute_force(location, compiled, dtype):
     mesh, camera = registry.mesh_of(location, dtype), registry.camera_of(dtype)
     origins, directions = (np.asarray(x).reshape(-1, 3) for x in camera.rays())
     integral, chord, largest = brute(mesh, origins, directions)
     hit = chord > 0
     assert 8 <= hit.sum() < 30
-    adjoint = jaxvr.Replay(native=native)
+    adjoint = jaxvr.Replay(native=compiled)
     low, high = float(mesh.values.min()), float(mesh.values.max())
 
     def seen(compositor, transfer):
@@ -78,11 +79,11 @@ def test_against_brute_force(location, native, dtype):
     assert np.all(got[hit, 2] == np.float64(np.asarray(0.2, dtype)))
 
 
-@pytest.mark.parametrize("native", ENGINES)
+@pytest.mark.parametrize("compiled", ENGINES)
 @pytest.mark.parametrize("compositor", [XRay(), XRay("optical depth"), MaximumIntensity()])
-def test_gradients_by_differences(compositor, native):
+def test_gradients_by_differences(compositor, compiled):
     mesh, camera = registry.mesh_of("corner", "float64"), registry.camera_of("float64")
-    adjoint = jaxvr.Replay(native=native)
+    adjoint = jaxvr.Replay(native=compiled)
 
     def image(values, points, camera, transfer):
         moved = mesh.replace(values=values, points=points)
@@ -107,6 +108,7 @@ def test_gradients_by_differences(compositor, native):
 @pytest.mark.parametrize("compositor", [XRay(), XRay("optical depth"), MaximumIntensity(), Over()])
 def test_replay_by_the_other_engine(compositor):
     """The forward pass by one engine and the replay by the other, which rounds in its own way."""
+    assert native.missing("float32") is None
     mesh, camera = registry.mesh_of("corner", "float32"), registry.camera_of("float32")
     transfer = registry.transfer_of("float32")
     integrator = compositor.default_integrator()
@@ -130,6 +132,8 @@ def test_replay_by_the_other_engine(compositor):
                 ),
                 state,
             )
+            if compositor == XRay("optical depth"):  # `finish` holds the length
+                cotangent = cotangent._replace(length=(jnp.zeros_like(cotangent.length[0]),) * 2)
         leaves = jax.tree.leaves(operands)
         asked = replay._flags([jnp.issubdtype(x.dtype, jnp.floating) for x in leaves])
         found = replay._backward(pipeline, backward, (operands, state, asked), (cotangent, None))
@@ -154,7 +158,7 @@ def test_what_was_cut_can_be_merged(compositor, dtype):
     depth = rng.uniform(0, 0.2, (count, rays))
     rgb = rng.uniform(0, 1, (count, 3, rays)) * depth[:, None]
     length = np.where(rng.uniform(size=(count, rays)) < 0.2, 0, rng.uniform(size=(count, rays)))
-    ends = rng.normal(size=(2, count, rays))
+    ends = rng.uniform(0.1, 1, size=(2, count, rays))
     last = rng.uniform(size=(count, rays)) < 0.7
 
     def fold(first, end):
@@ -171,11 +175,12 @@ def test_what_was_cut_can_be_merged(compositor, dtype):
     parts = fold(0, a), fold(a, b), fold(b, count)
     merge = compositor.merge
     for joined in (merge(merge(*parts[:2]), parts[2]), merge(parts[0], merge(*parts[1:]))):
-        for x, y in zip(jax.tree.leaves(joined), jax.tree.leaves(whole), strict=True):
-            if jnp.issubdtype(x.dtype, jnp.integer):
-                assert np.array_equal(x, y)
-            else:
-                assert np.max(np.abs(x - y)) <= 8 * EPS[dtype] * max(np.max(np.abs(y)), 1)
+        if compositor == MaximumIntensity():
+            assert all(np.array_equal(x, y) for x, y in zip(joined, whole, strict=True))
+            continue
+        for x, y in zip(joined, whole, strict=True):
+            x, y = compensated.value(x), compensated.value(y)
+            assert np.max(np.abs(x - y)) <= 2 * EPS[dtype] * np.max(np.abs(y))
 
 
 def test_offsets_and_units_come_back():
@@ -183,16 +188,14 @@ def test_offsets_and_units_come_back():
     camera = registry.camera_of("float32")
     near = registry.mesh_of("point", "float64")
     values = 101325 + 0.01 * np.asarray(near.values)
-    far = jaxvr.TetMesh.from_cells(
-        np.asarray(near.points), {"tetra": np.asarray(near.cells)}, values, dtype="float32"
-    )
+    far = registry.mesh_of("point", "float32").replace(values=values)
     assert far.offset
     exact = near.replace(values=values)
     want = jaxvr.render(exact, registry.camera_of("float64"), None, compositor=XRay())
-    for native in ENGINES:
-        adjoint = jaxvr.Replay(native=native)
+    for compiled in ENGINES:
+        adjoint = jaxvr.Replay(native=compiled)
         got = jaxvr.render(far, camera, None, compositor=XRay(), adjoint=adjoint)
-        assert np.max(np.abs(got / jnp.where(want == 0, 1, want) - (want != 0))) < 1e-6
+        assert np.max(np.abs(got - want)) < 1e-6 * np.max(want)
         transfer = ramp(101325.0, 101325.01)
         red = jaxvr.render(far, camera, transfer, compositor=MaximumIntensity(), adjoint=adjoint)
         same = jaxvr.render(
@@ -266,12 +269,14 @@ def test_what_cannot_be_is_said():
         XRay(wrong)
     none: Any = None
     for compositor in (Over(), MaximumIntensity(), XRay("optical depth")):
-        with pytest.raises(ValueError, match="transfer must be a TransferFunction"):
+        with pytest.raises(
+            ValueError, match=r"transfer must be a jaxvr.TransferFunction, but is a None"
+        ):
             jaxvr.render(mesh, camera, none, compositor=compositor)
     for compositor in (Over(), XRay("optical depth")):
-        unshaded = XRay().default_integrator()
+        blind = XRay().default_integrator()
         with pytest.raises(ValueError, match="composites light, and Unshaded"):
-            jaxvr.render(mesh, camera, transfer, compositor=compositor, integrator=unshaded)
+            jaxvr.render(mesh, camera, transfer, compositor=compositor, integrator=blind)
     with pytest.raises(ValueError, match=r"XRay\(of='scalar'\) does not look at the transfer"):
         jaxvr.fit(transfer, mesh, camera, np.zeros((5, 6, 4)), compositor=XRay())
     away = jaxvr.Camera.look_at((3, 3, 3), (6, 6, 6), width=4, height=4)
