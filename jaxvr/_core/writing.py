@@ -30,7 +30,7 @@ def shown(path: Any, most: int = 200) -> str:
 
 def place_of(path: Any) -> Path:
     """Where the file is in the end: `~` expanded and links followed, so that a link stays one."""
-    path = Path(path)
+    path = Path(os.fsdecode(path))
     with contextlib.suppress(RuntimeError):  # no home: a folder named ~
         path = path.expanduser()
     return Path(os.path.realpath(path))
