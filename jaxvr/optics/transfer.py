@@ -478,8 +478,8 @@ def _less_offset(positions: Any, offset: Any, dtype: Any) -> tuple[Any, float]:
     """Positions (K,) in `dtype` and what they are relative to. See `TransferFunction`."""
     said = 0.0 if offset is None else offset_of(offset)
     given = _wide("positions", positions)
-    as_it_is = isinstance(given, jax.Array) or (is_single(positions) and offset is not None)
-    if as_it_is or given.ndim != 1 or len(given) == 0:
+    as_it_is = is_single(positions) and offset is not None
+    if isinstance(given, jax.Array) or as_it_is or given.ndim != 1 or len(given) == 0:
         return as_floats("positions", given, ndim=1, dtype=dtype), said
     ends = float(given[0]), float(given[-1])
     away = offset_between(*ends, dtype) if np.isfinite(ends).all() else 0.0

@@ -129,7 +129,8 @@ def test_a_folder_with_other_uses_keeps_its_mode(folder, monkeypatch, tmp_path):
 def test_left_overs_of_killed_builds_go(folder):
     build.build("float32").unlink()
     old, new = folder / "tmp-jaxvr-old", folder / "tmp-jaxvr-new"
-    old.mkdir(), new.mkdir()
+    old.mkdir()
+    new.mkdir()
     os.utime(old, (0, 0))
     build.build("float32")
     assert not old.exists() and new.exists()
@@ -141,7 +142,10 @@ def test_builds_side_by_side(folder):
     threads = [
         threading.Thread(target=lambda: found.append(build.build("float32"))) for _ in range(6)
     ]
-    [t.start() for t in threads], [t.join() for t in threads]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
     assert len(set(found)) == 1 and len(found) == 6 and cache.is_sound(found[0])
 
 
