@@ -575,7 +575,7 @@ def test_float32_that_lost_its_digits_is_told(both):
             return kind(np.asarray(a, np.float32))
 
         for what, call in {
-            "steps of 0.0078 there, for": lambda: TransferFunction(
+            "positions come in float32": lambda: TransferFunction(
                 single(x[[0, -1]]), COLORS[:2], [1, 2], dtype="float32"
             ),
             "scalars come in float32": lambda: both.transfer(single(x)),
@@ -636,7 +636,7 @@ def test_values_that_no_float_holds_are_told(dtype):
         box.replace(values=few)
     box.replace(values=np.where(np.arange(48) == 7, -(2**63), 0))  # a power of two
     if dtype == "float32":
-        with pytest.warns(UserWarning, match="values are 0 in float32: the largest is 1e-300"):
+        with pytest.warns(UserWarning, match="0 of the 1 different values: they are too near 0"):
             box.replace(values=np.full(48, 1e-300))
 
 

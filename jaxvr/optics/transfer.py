@@ -151,8 +151,6 @@ class TransferFunction:
         positions = np.asarray(as_floats("positions", positions, ndim=1, dtype=np.float64))
         require_finite("positions", positions)
         _require_sorted(positions)
-        if offset is None:
-            tell_coarse(given)  # the constructor sees float64
         if not isinstance(colormap, str) and not callable(colormap):
             _require_unit_colors("The colour table", colormap)
         colors = colormaps.sample(colormap, _span(positions), srgb=srgb)

@@ -80,7 +80,8 @@ def lost_values(given: Any, numbers: np.ndarray, offset: float, dtype: np.dtype)
         (distinct, "different"),
         (distinct[elsewhere] if offset else distinct[:0], "different outlying"),
     ):
-        kept = len(np.unique((some - offset).astype(dtype)))
+        held = np.unique((some - offset).astype(dtype))
+        kept = len(held) if offset or held.any() else 0
         if len(some) and kept <= _KEPT * len(some):
             return (
                 f"float32 keeps {kept} of the {len(some)} {what} values: they {where}, from "
