@@ -169,7 +169,8 @@ def test_rounding_noise_takes_no_colours():
 def test_few_numbers_between_the_ends_make_few_points():
     """A pressure of which float32 keeps some steps: positions stay apart."""
     mesh = jaxvr.datasets.box((6, 5, 4), dtype="float32")
-    mesh = mesh.replace(values=101325 + np.float32(0.05) * mesh.points[:, 0])
+    with pytest.warns(UserWarning, match="values come in float32, which has steps of 0.0078"):
+        mesh = mesh.replace(values=101325 + np.float32(0.05) * mesh.points[:, 0])
     transfer = jaxvr.default_transfer(mesh)
     positions = np.asarray(transfer.positions)
     assert 2 <= len(positions) < 33 and (np.diff(positions) > 0).all()

@@ -239,6 +239,8 @@ def test_a_transfer_function_and_its_offset(both, tmp_path):
     same = TransferFunction(whole, COLORS[:2], [1, 2], dtype="float32")
     assert same.offset == 0  # JAX's arrays are taken as they are
     assert np.abs(same.relative_to(101325.01).positions - np.array([-0.01, 0.99])).max() < 1e-7
+    with pytest.warns(UserWarning, match="4 pairs of positions are no longer as far|are one in"):
+        tf.relative_to(0)
     shifted = tf.relative_to(101320)
     assert np.abs(shifted.absolute_positions() - x).max() < 1e-6
     double = tf.astype("float64").relative_to(0)
@@ -347,10 +349,8 @@ def test_positions_that_lost_their_digits_are_told(both):
             assert len(told) == 1 and told[0].filename == __file__
     # Numbers that are meant as they are, or that came out of `jit`, where nobody knows, are told
     # beside a mesh that has an offset.
-    lost = jax.tree.unflatten(
-        jax.tree.structure(both.transfer.relative_to(0)),
-        [jnp.asarray(a, jnp.float32) for a in (x, *others)],
-    )
+    leaves = [jnp.asarray(a, jnp.float32) for a in (x, *others)]
+    lost = TransferFunction.tree_unflatten(0.0, leaves)
     meant = both.transfer.replace(positions=jnp.asarray(x, jnp.float32), offset=0)
     for verb in (jaxvr.render, jaxvr.probe):
         for transfer in (lost, meant):

@@ -215,7 +215,7 @@ class TetMesh:
         exact = as_floats("points", np.asarray(points), dtype=np.float64)
         require_finite("points", exact)
         cells = np.asarray(self.cells) if is_concrete(self.cells) else None
-        used = exact if cells is None else exact[cells.reshape(-1)]
+        used = exact if cells is None else exact[used_points(self)]
         away = np.asarray(origin_between(used.min(axis=0), used.max(axis=0), self.dtype))
         if wide and (origin is None or not is_single(points)):
             place, away = added(place, away)
