@@ -13,11 +13,14 @@ HERE = Path(__file__).parent
 # Half a minute and more each; the others follow by their number of tests.
 SLOWEST = (
     "test_registry.py",
+    "test_experiments.py",
     "test_notebooks.py",
     "trace/test_flat_kbuffer.py",
-    "test_state_machine.py",
-    "trace/test_nasty_meshes.py",
     "test_docs.py",
+    "test_state_machine.py",
+    "composite/test_projections.py",
+    "trace/test_nasty_meshes.py",
+    "trace/test_kbuffer.py",
 )
 
 

@@ -79,11 +79,11 @@ def test_against_brute_force(location, compiled, dtype):
     assert np.all(got[hit, 2] == np.float64(np.asarray(0.2, dtype)))
 
 
-@pytest.mark.parametrize("compiled", ENGINES)
 @pytest.mark.parametrize("compositor", [XRay(), XRay("optical depth"), MaximumIntensity()])
-def test_gradients_by_differences(compositor, compiled):
+def test_gradients_by_differences(compositor):
+    """Of compiled loops; that JAX's give the same is asked below and in test_registry."""
     mesh, camera = registry.mesh_of("corner", "float64"), registry.camera_of("float64")
-    adjoint = jaxvr.Replay(native=compiled)
+    adjoint = jaxvr.Replay(native=True)
 
     def image(values, points, camera, transfer):
         moved = mesh.replace(values=values, points=points)
@@ -213,9 +213,9 @@ def _render(mesh, camera, transfer, compositor):
     return jaxvr.render(mesh, camera, transfer, compositor=compositor)
 
 
-def test_other_tracers_and_transforms(dtype):
-    mesh, camera = registry.mesh_of("point", dtype), registry.camera_of(dtype)
-    transfer = ramp(0.0, 1.0, dtype)
+def test_other_tracers_and_transforms():
+    mesh, camera = registry.mesh_of("point", "float32"), registry.camera_of("float32")
+    transfer = ramp(0.0, 1.0, "float32")
     for compositor in (XRay(), MaximumIntensity()):
         image = jaxvr.render(mesh, camera, transfer, compositor=compositor)
         same = [
@@ -229,7 +229,7 @@ def test_other_tracers_and_transforms(dtype):
             ),
         ]
         for other in same:
-            assert np.max(np.abs(other - image)) < 40 * EPS[dtype]
+            assert np.max(np.abs(other - image)) < 40 * EPS["float32"]
 
 
 def test_the_eye_inside_sees_what_is_ahead():
