@@ -248,6 +248,7 @@ def test_the_eye_inside_sees_what_is_ahead():
 
 @pytest.mark.outside("bluntfin.vtu")
 @pytest.mark.optimised
+@pytest.mark.filterwarnings("ignore:115 degenerate")
 def test_on_a_real_mesh(data_path):
     mesh = jaxvr.read_mesh(data_path("bluntfin.vtu"), "density", dtype="float64")
     camera = jaxvr.Camera.orbit(mesh, width=20, height=15, dtype="float64")
