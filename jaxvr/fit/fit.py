@@ -123,9 +123,10 @@ def fit(
       FitResult: transfer, loss_history, images, report(), save(folder).
 
     Raises:
-      ValueError: for arguments that do not fit each other, targets of bytes, a checkpoint of
-        another fit or none. FitError: if the loss becomes NaN or infinite. OSError: if no
-        checkpoint can be written. RenderError: if a ray could not be followed.
+      ValueError: for arguments that do not fit each other, what is free but not looked at by the
+        compositor, targets of bytes, a checkpoint of another fit or none. FitError: if the loss
+        becomes NaN or infinite. OSError: if no checkpoint can be written. RenderError: if a ray
+        could not be followed.
 
     Warns with a `jaxvr.ViewWarning` of cameras that do not see the volume, of control points that
     do not lie where its field does, and of targets that no picture can reach; of checkpoints as
@@ -133,8 +134,7 @@ def fit(
     """
     require_kind("transfer", transfer, TransferFunction)
     pixels = compositor_of(compositor)
-    if not (pixels.shades or "transfer" in pixels.needs):
-        raise ValueError(f"{pixels!r} does not look at the transfer function: nothing to fit.")
+    _require_seen(pixels, free)
     given = integrator_of(integrator, pixels), pixels, adjoint_of(adjoint)
     nouns = (*given, tracer_of(tracer))
     begin = time.perf_counter()
@@ -247,6 +247,19 @@ def fit(
         "held_out": likeness(others, unseen.split(unseen.targets)) if others else [],
     }
     return FitResult(fitted, result.loss_history, images, others, result.stopped, numbers)
+
+
+def _require_seen(compositor: AbstractCompositor, free: Any) -> None:
+    """What is free is looked at: else it would stay where it is without a word."""
+    if compositor.shades:
+        return
+    if "transfer" not in compositor.needs:
+        raise ValueError(f"{compositor!r} does not look at the transfer function: nothing to fit.")
+    if "extinctions" in ([free] if isinstance(free, str) else list(free)):
+        raise ValueError(
+            f"{compositor!r} does not look at extinctions, and they would not move: leave them out "
+            "of free, as in free=('colors',)."
+        )
 
 
 def _settled(nouns: Any, dtype: Any, cache: bool) -> tuple[Any, ...]:

@@ -246,6 +246,23 @@ def test_the_eye_inside_sees_what_is_ahead():
         assert np.allclose(red[0, 0], 1.0 if sign > 0 else 0.53, rtol=1e-14)
 
 
+def test_colours_are_fitted_through_the_maximum():
+    mesh, camera = registry.mesh_of("point", "float32"), registry.camera_of("float32")
+    target = ramp(0.0, 1.0, "float32")
+    image = jaxvr.render(mesh, camera, target, compositor=MaximumIntensity())
+    start = target.replace(colors=np.full((2, 3), 0.5))
+    result = jaxvr.fit(
+        *(start, mesh, camera, image),
+        compositor=MaximumIntensity(),
+        free="colors",
+        loss="l2",
+        iterations=60,
+        learning_rate=0.5,
+        progress=False,
+    )
+    assert result.loss_history[-1] < 0.02 * result.loss_history[0]
+
+
 @pytest.mark.outside("bluntfin.vtu")
 @pytest.mark.optimised
 @pytest.mark.filterwarnings("ignore:115 degenerate")
@@ -280,6 +297,8 @@ def test_what_cannot_be_is_said():
             jaxvr.render(mesh, camera, transfer, compositor=compositor, integrator=blind)
     with pytest.raises(ValueError, match=r"XRay\(of='scalar'\) does not look at the transfer"):
         jaxvr.fit(transfer, mesh, camera, np.zeros((5, 6, 4)), compositor=XRay())
+    with pytest.raises(ValueError, match=r"MaximumIntensity\(\) does not look at extinctions"):
+        jaxvr.fit(transfer, mesh, camera, np.zeros((5, 6, 4)), compositor=MaximumIntensity())
     away = jaxvr.Camera.look_at((3, 3, 3), (6, 6, 6), width=4, height=4)
     with pytest.warns(jaxvr.ViewWarning, match="blank. The volume lies behind the camera"):
         jaxvr.render(mesh, away, None, compositor=XRay())
