@@ -201,8 +201,10 @@ def _walk_again(
             bar = compositor.pull_back(piece, march.pixel, pixel, final, pixel_bar)
             segment_bar = bar.segment
             if compositor.shades:
-                rgb_bar = jnp.zeros_like(piece.rgb) if bar.rgb is None else bar.rgb
-                piece_bar = jnp.where(live[None], rgb_bar, 0), jnp.where(live, bar.optical_depth, 0)
+                by_pixel = (bar.rgb, piece.rgb), (bar.optical_depth, piece.optical_depth)
+                piece_bar = tuple(
+                    jnp.zeros_like(x) if b is None else jnp.where(live, b, 0) for b, x in by_pixel
+                )
                 by_light, table_bar = integrator.pull_back(
                     one.table, segment, cut, piece_bar, table_bar
                 )

@@ -129,5 +129,6 @@ class AbstractSum(AbstractCompositor):
 
 def seen(piece: Piece) -> Array:
     """Segments (R,) that are whole now and are in sight: those of no length are behind the eye, or
-    no more than a face."""
+    no more than a face. What adds up lengths takes all that are whole, `piece.last`: those of no
+    length add nothing, but their derivatives count where a ray passes a vertex or an edge."""
     return piece.last & (piece.segment.length > 0)

@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 
-from jaxvr.composite.base import AbstractSum, seen
+from jaxvr.composite.base import AbstractSum
 from jaxvr.numerics import compensated
 from jaxvr.numerics.compensated import Sum
 from jaxvr.optics.analytic import Analytic
@@ -74,7 +74,9 @@ class XRay(AbstractSum):
 
     def add(self, state, piece):
         front, back, length = piece.segment
-        here = seen(piece)
+        # Segments of no length too: they add nothing, but derivatives telescope only with theirs,
+        # as on rays through vertices.
+        here = piece.last
         length = jnp.where(here, length, 0)
         # Halves first: a sum of two scalars may overflow.
         more = jnp.where(here, length * (0.5 * front + 0.5 * back), 0)

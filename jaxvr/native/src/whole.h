@@ -58,11 +58,12 @@ static void add_largest(Lanes *lanes, int n) {
   }
 }
 
-/* Cotangents of the segments, from PIXEL: those of the integral and of the length. */
+/* Cotangents of the segments, from PIXEL: those of the integral and of the length. Segments of no
+ * length have them too, or derivatives would not telescope. */
 static void pull_integrals(Lanes *lanes, int n) {
   LANES_LOOP
   for (int i = 0; i < n; i++) {
-    word_t seen = in_sight(lanes, i);
+    word_t seen = ~MASK(lanes->integer[LOST][i] != 0);
     real bar = lanes->row[PIXEL][i], half = (real)0.5 * lanes->row[LENGTH][i] * bar;
     lanes->row[SBAR][i] = lanes->row[SBAR + 1][i] = PICK(seen, half, 0);
     lanes->row[SBAR + 2][i] = PICK(seen, bar * mean(lanes, i) + lanes->row[PIXEL + 1][i], 0);
