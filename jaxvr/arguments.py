@@ -145,7 +145,15 @@ def integrator_of(
 
 
 def compositor_of(compositor: Any) -> AbstractCompositor:
-    return _noun("compositor", compositor, "finish", Over)
+    found = _noun("compositor", compositor, "finish", Over)
+    names = ("needs", "shades", "backwards", "default_integrator", "init", "add", "done")
+    missing = [name for name in names if not hasattr(found, name)]
+    if missing:
+        raise ValueError(
+            f"compositor is a {type(found).__name__}, which has no {', '.join(missing)}: derive it "
+            "from jaxvr.composite.AbstractCompositor."
+        )
+    return found
 
 
 def adjoint_of(adjoint: Any) -> AbstractAdjoint:

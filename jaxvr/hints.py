@@ -83,7 +83,9 @@ def look(
     odd = (light or "transfer" in compositor.needs) and _odd((low, high), (first, last))
     # A cheap look at what `_dense` looks at again.
     dense = (
-        light and top <= 1 and top * diagonal > max(DENSE, DENSE_CELL * volume.n_tets ** (1 / 3))
+        "rgb" in compositor.needs  # of optical depths alone nothing hides another
+        and top <= 1
+        and top * diagonal > max(DENSE, DENSE_CELL * volume.n_tets ** (1 / 3))
     )
     if not (alpha < FAINT or odd or dense or cut):
         return

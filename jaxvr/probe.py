@@ -131,7 +131,7 @@ def probe(
     largest = np.abs(directions).max(axis=1, keepdims=True, initial=0)
     directions = np.ldexp(directions, -np.frexp(largest)[1])
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    pipeline = Pipeline(tracer_of(tracer), integrator_of(integrator), Over())
+    pipeline = Pipeline(tracer_of(tracer), integrator_of(integrator, Over()), Over())
     size = min(batch_size(volume.dtype), 1 << max(len(origins) - 1, 0).bit_length())
     parts, counts, status = [], [], []
     scene, table, units = _prepare(pipeline, bare(volume), bare(transfer))

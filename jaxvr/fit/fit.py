@@ -161,7 +161,8 @@ def fit(
     # A length to measure extinctions by, where the start has none.
     size = max(float(c.length.max()) for c in cameras) if volume is None else diagonal(volume)
     parameters = Parameters.of(transfer.astype(dtype), free, size)
-    look_at_targets(seen.split(seen.targets), parameters, background)
+    if pixels.needs & {"rgb", "transfer"}:  # else pictures are no colours, and have no bounds
+        look_at_targets(seen.split(seen.targets), parameters, background)
     dealt = deal(seen, rays, views, seed)
     batches, places = make_batches(seen, dealt)
     objective = Objective(loss_of(loss), *_settled(nouns, dtype, cache))
@@ -251,15 +252,19 @@ def fit(
 
 def _require_seen(compositor: AbstractCompositor, free: Any) -> None:
     """What is free is looked at: else it would stay where it is without a word."""
-    if compositor.shades:
-        return
-    if "transfer" not in compositor.needs:
+    needs = compositor.needs
+    if not (compositor.shades or "transfer" in needs):
         raise ValueError(f"{compositor!r} does not look at the transfer function: nothing to fit.")
-    if "extinctions" in ([free] if isinstance(free, str) else list(free)):
-        raise ValueError(
-            f"{compositor!r} does not look at extinctions, and they would not move: leave them out "
-            "of free, as in free=('colors',)."
-        )
+    names = [free] if isinstance(free, str) else list(free)
+    for name, other, seen in (
+        ("extinctions", "colors", compositor.shades),
+        ("colors", "extinctions", bool(needs & {"rgb", "transfer"})),
+    ):
+        if name in names and not seen:
+            raise ValueError(
+                f"{compositor!r} does not look at {name}, and they would not move: leave them out "
+                f"of free, as in free=({other!r},)."
+            )
 
 
 def _settled(nouns: Any, dtype: Any, cache: bool) -> tuple[Any, ...]:

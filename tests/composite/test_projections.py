@@ -3,6 +3,7 @@ compositors promise: that what was cut can be merged. All adjoints are in test_r
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -16,7 +17,7 @@ import jaxvr
 from jaxvr import MaximumIntensity, Over, XRay, native
 from jaxvr.adjoint import Pipeline, replay
 from jaxvr.adjoint.base import Operands
-from jaxvr.composite import Piece
+from jaxvr.composite import AbstractSum, Piece
 from jaxvr.numerics import compensated
 from jaxvr.optics import Segment
 from jaxvr.testing import BruteForce, assert_gradients
@@ -246,6 +247,85 @@ def test_the_eye_inside_sees_what_is_ahead():
         assert np.allclose(red[0, 0], 1.0 if sign > 0 else 0.53, rtol=1e-14)
 
 
+@pytest.mark.parametrize("compiled", ENGINES)
+def test_rays_through_vertices(compiled):
+    """Of a constant field the integral is the chord, which no point inside has a part in. Cells
+    that such rays only touch have segments of no length, whose derivatives count."""
+    mesh = datasets.box((2, 2, 2), dtype="float64")
+    mesh = mesh.replace(values=np.ones(len(mesh.points)))
+    middle = np.abs(np.asarray(mesh.points) - 0.5).max(1) < 0.25
+    assert middle.sum() == 1
+    origins = np.array([[0.5, 0.5, -1.0], [-0.5, -0.5, -0.5], [0.5, 0.25, -1.0]])
+    directions = np.array([[0.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
+
+    def chords(points):
+        moved = mesh.replace(points=points)
+        adjoint = jaxvr.Replay(native=compiled)
+        return jaxvr.render_rays(
+            moved, origins, directions, None, compositor=XRay(), adjoint=adjoint
+        )[:, 0]
+
+    got, pull_back = jax.vjp(chords, mesh.points)
+    assert np.allclose(got, [1, np.sqrt(3), 1], rtol=1e-14)
+    for ray in range(3):
+        (slope,) = pull_back(jnp.zeros(3).at[ray].set(1.0))
+        assert np.max(np.abs(slope)) > 0.1
+        assert np.max(np.abs(np.asarray(slope)[middle])) < 1e-12
+
+
+def test_of_colours_alone():
+    """A compositor that sees no optical depth has no cotangent of it."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Light(AbstractSum):
+        needs = frozenset({"rgb"})
+
+        def default_integrator(self):
+            return jaxvr.Analytic()
+
+        def init(self, rays, dtype):
+            return jnp.zeros((3, rays), dtype)
+
+        def add(self, state, piece):
+            return state + piece.rgb
+
+        def finish(self, state, transfer, scale):
+            return jnp.concatenate([state, jnp.ones_like(state[:1])])
+
+        def merge(self, front, back):
+            return front + back
+
+    mesh = registry.mesh_of("point", "float64")
+    segments = jaxvr.trace(mesh, registry.camera_of("float64"))
+    transfer = registry.transfer_of("float64")
+
+    def total(colors, adjoint):
+        moved = transfer.replace(colors=colors)
+        return jaxvr.shade(segments, moved, compositor=Light(), adjoint=adjoint)[..., :3].sum()
+
+    by = [jax.grad(total)(transfer.colors, a) for a in (jaxvr.Replay(), jaxvr.Direct(64))]
+    assert np.max(np.abs(by[1])) > 0.1
+    assert np.allclose(*by, rtol=1e-12)
+
+
+def test_extinctions_are_fitted_through_optical_depths():
+    """Whose pictures are no colours: that they are above 1, and above alpha, is not warned of."""
+    mesh, camera = registry.mesh_of("point", "float32"), registry.camera_of("float32")
+    target = jaxvr.TransferFunction([0.0, 1.0], np.ones((2, 3)), [3.0, 6.0], dtype="float32")
+    image = jaxvr.render(mesh, camera, target, compositor=XRay("optical depth"))
+    assert image.max() > 2
+    result = jaxvr.fit(
+        *(target.replace(extinctions=[4.0, 4.0]), mesh, camera, image),
+        compositor=XRay("optical depth"),
+        free="extinctions",
+        loss="l2",
+        iterations=40,
+        learning_rate=0.1,
+        progress=False,
+    )
+    assert result.loss_history[-1] < 0.1 * result.loss_history[0]
+
+
 def test_colours_are_fitted_through_the_maximum():
     mesh, camera = registry.mesh_of("point", "float32"), registry.camera_of("float32")
     target = ramp(0.0, 1.0, "float32")
@@ -297,8 +377,26 @@ def test_what_cannot_be_is_said():
             jaxvr.render(mesh, camera, transfer, compositor=compositor, integrator=blind)
     with pytest.raises(ValueError, match=r"XRay\(of='scalar'\) does not look at the transfer"):
         jaxvr.fit(transfer, mesh, camera, np.zeros((5, 6, 4)), compositor=XRay())
+    depths = XRay("optical depth")
+    with pytest.raises(ValueError, match=r"does not look at colors, .* free=\('extinctions',\)"):
+        jaxvr.fit(transfer, mesh, camera, np.zeros((5, 6, 4)), compositor=depths)
+    with pytest.raises(ValueError, match="Over composites light, and Unshaded"):
+        jaxvr.probe(mesh, camera, transfer, integrator=XRay().default_integrator())
+
+    class Bare:
+        def finish(self, state, transfer, scale): ...
+
+    with pytest.raises(ValueError, match="compositor is a Bare, which has no needs, .*done"):
+        jaxvr.render(mesh, camera, transfer, compositor=Bare())  # pyright: ignore
     with pytest.raises(ValueError, match=r"MaximumIntensity\(\) does not look at extinctions"):
         jaxvr.fit(transfer, mesh, camera, np.zeros((5, 6, 4)), compositor=MaximumIntensity())
     away = jaxvr.Camera.look_at((3, 3, 3), (6, 6, 6), width=4, height=4)
     with pytest.warns(jaxvr.ViewWarning, match="blank. The volume lies behind the camera"):
         jaxvr.render(mesh, away, None, compositor=XRay())
+    # Optical depths hide nothing, however large they are: no warning of opacities.
+    large = mesh.replace(points=1000 * mesh.points)
+    view = jaxvr.Camera.orbit(large, width=4, height=4)
+    thick = jaxvr.TransferFunction([0.0, 1.0], np.ones((2, 3)), [0.9, 0.9])
+    with pytest.warns(jaxvr.ViewWarning, match="One cell hides what is behind it"):
+        jaxvr.render(large, view, thick)
+    jaxvr.render(large, view, thick, compositor=depths)
