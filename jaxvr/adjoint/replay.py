@@ -202,9 +202,10 @@ def _walk_again(
             segment_bar = bar.segment
             if compositor.shades:
                 by_pixel = (bar.rgb, piece.rgb), (bar.optical_depth, piece.optical_depth)
-                piece_bar = tuple(
+                rgb_bar, depth_bar = (
                     jnp.zeros_like(x) if b is None else jnp.where(live, b, 0) for b, x in by_pixel
                 )
+                piece_bar = rgb_bar, depth_bar
                 by_light, table_bar = integrator.pull_back(
                     one.table, segment, cut, piece_bar, table_bar
                 )
