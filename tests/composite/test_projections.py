@@ -278,7 +278,7 @@ def test_of_colours_alone():
 
     @dataclasses.dataclass(frozen=True)
     class Light(AbstractSum):
-        needs = frozenset({"rgb"})
+        needs = frozenset({"rgb"})  # pyright: ignore[reportAssignmentType]
 
         def default_integrator(self):
             return jaxvr.Analytic()
