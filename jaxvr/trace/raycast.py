@@ -147,7 +147,7 @@ class RayCast(AbstractTracer):
     Gradients: with respect to point positions, values, ray origins and directions. They are those
     of the image with the order of cells held fixed, which is the gradient wherever it exists: not
     on rays that only touch an edge or a vertex of the boundary. Zero by convention where a ray lies
-    in a face's plane, and through segments of no length.
+    in a face's plane.
     """
 
     def reversed(self):
