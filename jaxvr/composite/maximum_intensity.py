@@ -60,9 +60,9 @@ class MaximumIntensity(AbstractCompositor):
 
     def add(self, state, piece):
         front, back, _ = piece.segment
-        at_back = back > front
+        at_back = _exceeds(back, front)
         most = jnp.where(at_back, back, front)
-        larger = seen(piece) & ((state.where < 0) | (most > state.largest))
+        larger = seen(piece) & ((state.where < 0) | _exceeds(most, state.largest))
         return MaximumState(
             jnp.where(larger, most, state.largest),
             jnp.where(larger, 2 * state.passed + at_back, state.where),
@@ -76,7 +76,7 @@ class MaximumIntensity(AbstractCompositor):
         return jnp.concatenate([rgb, hit[None].astype(rgb.dtype)])
 
     def merge(self, front, back):
-        larger = (back.where >= 0) & ((front.where < 0) | (back.largest > front.largest))
+        larger = (back.where >= 0) & ((front.where < 0) | _exceeds(back.largest, front.largest))
         return MaximumState(
             jnp.where(larger, back.largest, front.largest),
             jnp.where(larger, back.where + 2 * front.passed, front.where),
@@ -88,3 +88,9 @@ class MaximumIntensity(AbstractCompositor):
         at_back = final.where % 2 == 1
         front, back = (jnp.where(here & x, cotangent.largest, 0) for x in (~at_back, at_back))
         return Piece(None, None, Segment(front, back, jnp.zeros_like(front)), None)
+
+
+def _exceeds(a: Array, b: Array) -> Array:
+    """Whether a > b, with NaN above all numbers: a ray that meets one has a colour of NaN, as with
+    other compositors, and not that of the rest of it."""
+    return (a > b) | (jnp.isnan(a) & ~jnp.isnan(b))

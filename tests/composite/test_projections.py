@@ -326,6 +326,29 @@ def test_extinctions_are_fitted_through_optical_depths():
     assert result.loss_history[-1] < 0.1 * result.loss_history[0]
 
 
+@pytest.mark.parametrize("compiled", ENGINES)
+def test_a_scalar_that_is_none_is_seen(compiled):
+    """Under jit, where nobody can refuse them: rays that meet a NaN have no colour, others theirs,
+    whatever lies before and behind it."""
+    mesh = datasets.box((3, 3, 3), dtype="float64")
+    points = np.asarray(mesh.points)
+    origins, directions = np.array([[0.31, 0.37, -1.0], [0.9, 0.9, -1.0]]), np.zeros((2, 3))
+    directions[:] = 0.01, 0.007, 1.0
+    adjoint = jaxvr.Replay(native=compiled)
+
+    @quick.jit
+    def red(values):
+        moved, transfer = mesh.replace(values=values), ramp(0, 1)
+        how = {"compositor": MaximumIntensity(), "adjoint": adjoint}
+        return jaxvr.render_rays(moved, origins, directions, transfer, **how)[:, 0]
+
+    fine = red(mesh.values)
+    for place in ([1 / 3] * 3, [1 / 3, 1 / 3, 0], [1 / 3, 1 / 3, 1]):
+        at = np.argmin(np.abs(points - place).sum(1))
+        got = red(mesh.values.at[at].set(jnp.nan))
+        assert np.isnan(got[0]) and got[1] == fine[1]
+
+
 def test_colours_are_fitted_through_the_maximum():
     mesh, camera = registry.mesh_of("point", "float32"), registry.camera_of("float32")
     target = ramp(0.0, 1.0, "float32")

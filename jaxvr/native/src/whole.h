@@ -44,13 +44,16 @@ static void add_integrals(Lanes *lanes, int n) {
   add_lengths(lanes, n);
 }
 
+/* Whether a > b, with NaN above all numbers. */
+static inline int exceeds(real a, real b) { return (a > b) | ((a != a) & (b == b)); }
+
 static void add_largest(Lanes *lanes, int n) {
   LANES_LOOP
   for (int i = 0; i < n; i++) {
     real front = lanes->row[FRONT][i], back = lanes->row[BACK][i];
-    int at_back = back > front, before = lanes->integer[WHERE][i];
+    int at_back = exceeds(back, front), before = lanes->integer[WHERE][i];
     real most = at_back ? back : front;
-    int larger = (before < 0) | (most > lanes->row[SUMS][i]);
+    int larger = (before < 0) | exceeds(most, lanes->row[SUMS][i]);
     larger &= (int)in_sight(lanes, i) & 1;
     lanes->row[SUMS][i] = larger ? most : lanes->row[SUMS][i];
     lanes->integer[WHERE][i] = larger ? 2 * lanes->integer[SLAB][i] + at_back : before;
