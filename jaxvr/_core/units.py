@@ -49,6 +49,13 @@ def is_large(exponent: Array, dtype: Any) -> Array:
     return exponent > SMALL[np.dtype(dtype).name]
 
 
+def is_extreme(x: Array) -> Array:
+    """Whether digits of numbers of the size of x (), or of their reciprocals, get lost; also where
+    those of x were, as those of a product may be."""
+    exponent = exponent_of(x)
+    return is_none(exponent) | is_small(exponent, x.dtype) | is_large(exponent, x.dtype)
+
+
 def power_of_two(exponent: Array, dtype: Any) -> Array:
     """2^exponent (), or the nearest power that is a normal number and has such a reciprocal."""
     info = jnp.finfo(dtype)

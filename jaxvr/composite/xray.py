@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 
+from jaxvr._core.units import is_extreme, times_told
 from jaxvr.composite.base import AbstractSum
 from jaxvr.numerics import compensated
 from jaxvr.numerics.compensated import Sum
@@ -49,7 +50,9 @@ class XRay(AbstractSum):
     Exact to rounding on tetrahedra with fields that are linear in each cell. Differentiable in
     values, points and camera, and of optical depth in the transfer function. The edge of the
     volume's silhouette has no derivative of its own there: the integral goes to 0 with the chord,
-    and alpha steps.
+    and alpha steps. Where the largest scalar times the largest coordinate is not between 2^-100 and
+    2^100 (2^-960 and 2^960 in float64) derivatives of the scalar's integral are NaN, since floats
+    on their way are out of range; the picture is right as long as it is a normal float.
 
     Raises:
       ValueError: for another `of`.
@@ -89,7 +92,10 @@ class XRay(AbstractSum):
     def finish(self, state, transfer, scale):
         integral, length = (compensated.value(x) for x in state)
         if self.of == "scalar":
-            integral = integral / scale.scalar / scale.length
+            # Products: of two quotients XLA makes one, by what may be no normal number.
+            by_scalar, by_length = 1 / scale.scalar, 1 / scale.length
+            good = ~is_extreme(by_scalar * by_length)
+            integral = times_told(integral * by_scalar, by_length, good)
             if scale.offset is not None:
                 integral = integral + scale.offset * (length / scale.length)
         hit = jnp.where(jax.lax.stop_gradient(length) > 0, 1, 0).astype(integral.dtype)

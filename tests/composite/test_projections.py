@@ -210,6 +210,27 @@ def test_offsets_and_units_come_back():
     assert np.array_equal(scaled[..., 0], plain[..., 0] * 2.0**70)
 
 
+@pytest.mark.parametrize("scalar, length", [(1e38, 1.0), (2e-30, 2.0**-27), (3.0, 2.0**-27)])
+def test_integrals_near_the_ends_of_floats(scalar, length):
+    """Right as long as they are floats; derivatives are right or NaN, and never lost."""
+    mesh = datasets.box((2, 2, 2), dtype="float32")
+    mesh = mesh.replace(points=mesh.points * np.float32(length))
+    origins = np.array([[0.31, 0.47, -1.0]], np.float32) * np.float32(length)
+    directions = np.array([[0.0, 0.0, 1.0]], np.float32)
+
+    def integral(values):
+        moved = mesh.replace(values=values)
+        return jaxvr.render_rays(moved, origins, directions, None, compositor=XRay())[0, 0]
+
+    values = jnp.full(mesh.values.shape, scalar, "float32")
+    found, slope = jax.value_and_grad(integral)(values)
+    assert np.allclose(found, np.float64(values[0]) * length, rtol=1e-6, atol=0)
+    if scalar == 3:
+        assert np.allclose(slope.sum(), length, rtol=1e-6, atol=0)
+    else:
+        assert np.isnan(slope).any()
+
+
 def _render(mesh, camera, transfer, compositor):
     return jaxvr.render(mesh, camera, transfer, compositor=compositor)
 
