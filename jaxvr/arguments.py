@@ -94,8 +94,7 @@ def transfer_of(
     compositor: what it is for; one that does not look at it gets a point in its place, for None as
         well.
     """
-    blind = compositor is not None and not (compositor.shades or "transfer" in compositor.needs)
-    if blind:
+    if compositor is not None and not compositor.reads_transfer:
         if transfer is not None:
             require_kind("transfer", transfer, TransferFunction)
         return TransferFunction([0.0], [[0.0] * 3], [0.0], dtype=dtype_of(volume))
@@ -146,7 +145,16 @@ def integrator_of(
 
 def compositor_of(compositor: Any) -> AbstractCompositor:
     found = _noun("compositor", compositor, "finish", Over)
-    names = ("needs", "shades", "backwards", "default_integrator", "init", "add", "done")
+    names = (
+        "needs",
+        "shades",
+        "reads_transfer",
+        "backwards",
+        "default_integrator",
+        "init",
+        "add",
+        "done",
+    )
     missing = [name for name in names if not hasattr(found, name)]
     if missing:
         raise ValueError(

@@ -80,7 +80,7 @@ def look(
     alpha, low, high, first, last, top, diagonal, cut = (float(x) for x in glance)
     low, high, first, last = (x + volume.offset for x in (low, high, first, last))
     light = compositor.shades
-    odd = (light or "transfer" in compositor.needs) and _odd((low, high), (first, last))
+    odd = compositor.reads_transfer and _odd((low, high), (first, last))
     # A cheap look at what `_dense` looks at again.
     dense = (
         "rgb" in compositor.needs  # of optical depths alone nothing hides another

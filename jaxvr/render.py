@@ -489,8 +489,9 @@ def _finish(pipeline, adjoint, scene, rays, transfer, scale, count):
     longest = lax.stop_gradient(pipeline.tracer.longest(scene))
     table = pipeline.integrator.prepare(transfer, longest.dtype, longest)
     state, status = adjoint.run(pipeline, Operands(scene, rays, table))
-    finish = pipeline.compositor.finish
-    rgba = jax.vmap(lambda state: finish(state, transfer, scale))(state)
+    compositor = pipeline.compositor
+    shown = transfer if "transfer" in compositor.needs else None
+    rgba = jax.vmap(lambda state: compositor.finish(state, shown, scale))(state)
     return jnp.moveaxis(rgba, 1, 2).reshape(-1, 4)[:count], status.reshape(-1)[:count]
 
 

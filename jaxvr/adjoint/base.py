@@ -95,6 +95,7 @@ def shade_piece(pipeline: Pipeline, operands: Operands, march: March):
         piece = Piece(
             jnp.where(live[None], rgb, 0), jnp.where(live, depth, 0), segment, live & finished
         )
+        piece = piece.only(pipeline.compositor.needs)
         pixel = pipeline.compositor.add(march.pixel, piece)
     return pixel, cursor, finished, piece, cut
 

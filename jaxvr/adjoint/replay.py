@@ -201,11 +201,11 @@ def _walk_again(
             bar = compositor.pull_back(piece, march.pixel, pixel, final, pixel_bar)
             segment_bar = bar.segment
             if compositor.shades:
-                by_pixel = (bar.rgb, piece.rgb), (bar.optical_depth, piece.optical_depth)
-                rgb_bar, depth_bar = (
-                    jnp.zeros_like(x) if b is None else jnp.where(live, b, 0) for b, x in by_pixel
+                none = jnp.zeros_like(segment.length)
+                piece_bar = (
+                    jnp.stack([none] * 3) if bar.rgb is None else jnp.where(live, bar.rgb, 0),
+                    none if bar.optical_depth is None else jnp.where(live, bar.optical_depth, 0),
                 )
-                piece_bar = rgb_bar, depth_bar
                 by_light, table_bar = integrator.pull_back(
                     one.table, segment, cut, piece_bar, table_bar
                 )

@@ -27,10 +27,11 @@ class Piece(NamedTuple):
     """A part of a segment, of each of R rays.
 
     rgb (3, R): premultiplied colour. optical_depth (R,). Both are 0 of rays without a segment.
-    segment: that which it is a part of. last (R,) bool: the ray has a segment, and this is its last
-    piece: what sees segments as a whole looks at them then, once for each.
+    segment: that which it is a part of. Each is None for a compositor that does not need it.
+    last (R,) bool: the ray has a segment, and this is its last piece: what sees segments as a whole
+    looks at them then, once for each.
 
-    As a cotangent, from `AbstractCompositor.pull_back`: None for what a compositor does not see,
+    As a cotangent, from `AbstractCompositor.pull_back`: None for what a compositor does not need,
     and for `last`.
     """
 
@@ -38,6 +39,16 @@ class Piece(NamedTuple):
     optical_depth: Any
     segment: Any
     last: Any
+
+    def only(self, needs: frozenset[str]) -> Piece:
+        """What a compositor needs of it: to look at anything else is an error then, where it would
+        be differentiated wrongly, or be 0, without a word."""
+        return Piece(
+            self.rgb if "rgb" in needs else None,
+            self.optical_depth if "optical_depth" in needs else None,
+            self.segment if "scalar" in needs else None,
+            self.last,
+        )
 
 
 class Scale(NamedTuple):
@@ -69,6 +80,11 @@ class AbstractCompositor(abc.ABC):
         """Whether it sees what an integrator makes of segments."""
         return bool(self.needs & {"rgb", "optical_depth"})
 
+    @property
+    def reads_transfer(self) -> bool:
+        """Whether pictures depend on a transfer function."""
+        return self.shades or "transfer" in self.needs
+
     @abc.abstractmethod
     def default_integrator(self) -> AbstractIntegrator:
         """The one that serves where the user names none."""
@@ -90,8 +106,8 @@ class AbstractCompositor(abc.ABC):
     def finish(self, state: Any, transfer: Any, scale: Any) -> Array:
         """Premultiplied RGBA (4, R); differentiable in all that is a float.
 
-        transfer: a `TransferFunction` with positions in the scalars of the pieces; scale: a
-        `Scale`. What does not look at them may be given None.
+        transfer: a `TransferFunction` with positions in the scalars of the pieces; None unless
+        "transfer" is needed. scale: a `Scale`, or None for what does not need the scalar.
         """
 
     @abc.abstractmethod
@@ -119,11 +135,7 @@ class AbstractSum(AbstractCompositor):
             state = self.add(before, Piece(rgb, optical_depth, segment, piece.last))
             return [x for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-        pulled = jax.vjp(floats, *piece[:3])[1](jax.tree.leaves(cotangent))
-        rgb, optical_depth, segment = (
-            bar if name in self.needs else None
-            for name, bar in zip(("rgb", "optical_depth", "scalar"), pulled, strict=True)
-        )
+        rgb, optical_depth, segment = jax.vjp(floats, *piece[:3])[1](jax.tree.leaves(cotangent))
         return Piece(rgb, optical_depth, segment, None)
 
 

@@ -146,9 +146,10 @@ class Over(AbstractCompositor):
 
     def merge(self, front, back):
         through = compensated.exp_minus(front.depth)[None]
-        total, excess = compensated.add(front.depth, back.depth[0])
-        light, lost = compensated.add(front.rgb, through * back.rgb[0])
-        return OverState((total, excess + back.depth[1]), (light, lost + through * back.rgb[1]))
+        light = through * back.rgb[0], through * back.rgb[1]
+        return OverState(
+            compensated.join(front.depth, back.depth), compensated.join(front.rgb, light)
+        )
 
     def pull_back(self, piece, before, after, final, cotangent):
         rgb_bar, depth_bar = cotangent.rgb[0], cotangent.depth[0]

@@ -102,8 +102,4 @@ class XRay(AbstractSum):
         return jnp.stack([integral, integral, integral, hit])
 
     def merge(self, front, back):
-        def both(a: Sum, b: Sum) -> Sum:
-            total, excess = compensated.add(a, b[0])
-            return total, excess + b[1]
-
-        return XRayState(both(front.integral, back.integral), both(front.length, back.length))
+        return XRayState(*map(compensated.join, front, back))

@@ -253,7 +253,7 @@ def fit(
 def _require_seen(compositor: AbstractCompositor, free: Any) -> None:
     """What is free is looked at: else it would stay where it is without a word."""
     needs = compositor.needs
-    if not (compositor.shades or "transfer" in needs):
+    if not compositor.reads_transfer:
         raise ValueError(f"{compositor!r} does not look at the transfer function: nothing to fit.")
     names = [free] if isinstance(free, str) else list(free)
     for name, other, seen in (

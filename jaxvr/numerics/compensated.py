@@ -24,6 +24,12 @@ def add(total: Sum, x: Array) -> Sum:
     return new, (new - value) - y
 
 
+def join(a: Sum, b: Sum) -> Sum:
+    """The sum of two sums."""
+    total, excess = add(a, b[0])
+    return total, excess + b[1]
+
+
 def value(total: Sum) -> Array:
     return total[0] - total[1]
 

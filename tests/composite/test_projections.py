@@ -387,6 +387,33 @@ def test_colours_are_fitted_through_the_maximum():
     assert result.loss_history[-1] < 0.02 * result.loss_history[0]
 
 
+def test_what_is_not_needed_is_not_given():
+    """Else it would be 0, or without its derivative, where it is looked at all the same."""
+    mesh, camera = registry.mesh_of("point", "float32"), registry.camera_of("float32")
+    transfer = registry.transfer_of("float32")
+
+    class Blind(MaximumIntensity):
+        @property
+        def needs(self):
+            return frozenset({"scalar"})
+
+    class Weighted(XRay):
+        @property
+        def needs(self):
+            return frozenset({"optical_depth"})
+
+        def add(self, state, piece):
+            length = piece.segment.length
+            weighted = piece._replace(optical_depth=piece.optical_depth * length)
+            return super().add(state, weighted)
+
+    for compositor, error in ((Blind(), TypeError), (Weighted("optical depth"), AttributeError)):
+        for compiled in (None, False):
+            with pytest.raises(error, match="None"):
+                adjoint = jaxvr.Replay(native=compiled)
+                jaxvr.render(mesh, camera, transfer, compositor=compositor, adjoint=adjoint)
+
+
 @pytest.mark.outside("bluntfin.vtu")
 @pytest.mark.optimised
 @pytest.mark.filterwarnings("ignore:115 degenerate")
