@@ -26,6 +26,7 @@ from jaxvr.trace import stream as streams
 from jaxvr.trace.entry import search
 from jaxvr.trace.rasterize import triangle_source
 from jaxvr.trace.select import Sort, next_selection, sort_first, start_selection
+from jaxvr.view.rays import Rays
 from jaxvr.view.tiles import batch_size, batches, tile
 from jaxvr.volume import packing
 from jaxvr.volume.connectivity import FACES
@@ -85,7 +86,7 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, k: int, repeat: int) -> lis
     camera, transfer = viewpoints(volume, size)[-1], transfer_of(volume)
     tracer, sort = jaxvr.KBuffer(k=k), Sort(jaxvr.order.Centroid())
     scene, rays = jax.jit(tracer.prepare)(volume), _tiles(camera)
-    rays = jax.jit(jax.vmap(partial(tracer.prepare_rays, scene)))(*rays)
+    rays = jax.jit(jax.vmap(partial(tracer.prepare_rays, scene)))(Rays(*rays))
 
     def of_tiles(stage, *static):
         return jax.jit(lambda scene, rays: lax.map(lambda r: stage(scene, r, *static), rays))
@@ -93,7 +94,7 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, k: int, repeat: int) -> lis
     counts = of_tiles(_select, sort)(scene, rays)
     caster = jaxvr.RayCast()
     cast = jax.jit(caster.prepare)(volume)
-    cast_rays = jax.jit(jax.vmap(partial(caster.prepare_rays, cast)))(*_tiles(camera))
+    cast_rays = jax.jit(jax.vmap(partial(caster.prepare_rays, cast)))(Rays(*_tiles(camera)))
     search_all = jax.jit(lambda s, rays: lax.map(lambda r: _entries(caster, s, r), rays))
     sort_all = jax.jit(lambda s, c: lax.map(lambda n: _sort_only(s, n), c))
     words = np.asarray(volume.boundary)

@@ -57,6 +57,7 @@ from jaxvr.trace.local import edges_to_apex, exit_face, leave_by
 from jaxvr.trace.scene import entry_corners, make_scene, merged_points
 from jaxvr.trace.shear import ShearedRays, shear_points, shear_rays
 from jaxvr.view import tiles
+from jaxvr.view.rays import Rays
 from jaxvr.volume import packing
 
 BATCH = tiles.batch_size("float32")
@@ -316,7 +317,7 @@ def vertex_start(exact: bool, scene: VertexScene, start: Start) -> tuple[VertexR
     origins, shift = start.origins, jnp.zeros_like(start.distance)
     if not exact:  # exact paths are those of the very rays whose entries were found
         origins, shift = centred(origins, start.directions, scene.centre)
-    r = shear_rays(origins, start.directions, jnp.ones((), origins.dtype))
+    r = shear_rays(Rays(origins, start.directions), jnp.ones((), origins.dtype))
     rows = jnp.stack([r.axis_x, r.axis_y, r.axis_z, jnp.full_like(r.axis_x, 3)])
     rays = VertexRays(r, rows)
     word = jnp.maximum(start.face, 0)
@@ -380,7 +381,7 @@ CAST = jaxvr.RayCast()
 
 
 def cast_start(scene: Any, start: Start) -> tuple[Any, Any]:
-    rays = CAST.prepare_rays(scene, start.origins, start.directions)
+    rays = CAST.prepare_rays(scene, Rays(start.origins, start.directions))
     entries = no_entries(start.face.shape[0], start.origins.dtype)
     depth = start.distance / rays.stretch
     entries = entries._replace(
@@ -443,7 +444,7 @@ def first_entries(mesh: jaxvr.TetMesh, origins: Array, directions: Array) -> Sta
     boxes = build_boxes(scene)
 
     def one(rays: tuple[Array, Array]) -> Start:
-        sheared = shear_rays(*rays, scene.scale)
+        sheared = shear_rays(Rays(*rays), scene.scale)
         none = jnp.full(BATCH, -jnp.inf, mesh.dtype), jnp.full(BATCH, -1, jnp.int32)
         entries = search(scene, sheared, boxes, jnp.ones(BATCH, bool), none)
         return Start(*rays, entries.face[0], entries.depth[0] * sheared.stretch)

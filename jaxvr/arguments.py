@@ -28,6 +28,7 @@ from jaxvr.optics.unshaded import Unshaded
 from jaxvr.trace import AbstractTracer, RayCast, Segments
 from jaxvr.trace.integrity import require_segments
 from jaxvr.view.camera import Camera
+from jaxvr.view.rays import Rays
 from jaxvr.volume.integrity import require_mesh
 from jaxvr.volume.mesh import TetMesh
 
@@ -185,9 +186,9 @@ def _noun(name: str, given: Any, method: str, usual: type, default: Any = None) 
     return given
 
 
-def rays_of(origins: Any, directions: Any, volume: Any) -> tuple[Array, Array]:
-    """Origins and directions of one shape (..., 3), the latter not zero; the former relative to the
-    volume's origin."""
+def rays_of(origins: Any, directions: Any, volume: Any, near: Any = None, far: Any = None) -> Rays:
+    """Rays with origins and directions of one shape (..., 3), the latter not zero, the former
+    relative to the volume's origin."""
     dtype = dtype_of(volume)
     if any(volume.origin) and is_single(origins):
         step = np.spacing(np.float32(np.abs(volume.origin).max()))
@@ -218,4 +219,32 @@ def rays_of(origins: Any, directions: Any, volume: Any) -> tuple[Array, Array]:
     origins, directions = (
         jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in (origins, directions)
     )
-    return origins, directions
+    return between(origins, directions, near, far)
+
+
+def between(origins: Array, directions: Array, near: Any, far: Any) -> Rays:
+    """Rays (..., 3) with an interval, numbers or (...,), in their dtype: `near` at least 0, and
+    `far` at least `near`."""
+    shape, dtype = origins.shape[:-1], origins.dtype
+    near, far = (
+        None if x is None else _distance(name, x, shape, dtype)
+        for name, x in (("near", near), ("far", far))
+    )
+    if near is not None:
+        near = jnp.where(near < 0, 0, near)
+    if far is not None:
+        least = 0 if near is None else near
+        far = jnp.where(far < least, least, far)
+    return Rays(origins, directions, near, far)
+
+
+def _distance(name: str, x: Any, shape: tuple[int, ...], dtype: Any) -> Array:
+    x = as_floats(name, x)
+    if is_concrete(x) and np.isnan(np.asarray(x)).any():
+        raise ValueError(f"{name} is NaN for {int(np.isnan(np.asarray(x)).sum())} ray(s).")
+    try:
+        return jnp.broadcast_to(jnp.asarray(x, dtype), shape)
+    except ValueError:
+        raise ValueError(
+            f"{name} must be a number or have the shape {shape} of the rays, but has {x.shape}."
+        ) from None

@@ -34,6 +34,7 @@ from jaxvr.trace import AbstractTracer
 from jaxvr.trace.recorded import record
 from jaxvr.units import Units, mesh_in, transfer_in, units_of
 from jaxvr.view.camera import Camera
+from jaxvr.view.rays import Rays
 from jaxvr.view.tiles import batch_size
 from jaxvr.volume.mesh import TetMesh
 
@@ -125,7 +126,8 @@ def probe(
     elif pixels is not None:
         raise ValueError("pixels belong to a camera, but rays were given. Pass only those wanted.")
     else:
-        origins, directions = (np.asarray(x) for x in rays_of(*camera, volume))
+        rays = rays_of(*camera, volume)
+        origins, directions = np.asarray(rays.origins), np.asarray(rays.directions)
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     # By a power of two first, so that squares neither under- nor overflow.
     largest = np.abs(directions).max(axis=1, keepdims=True, initial=0)
@@ -193,7 +195,7 @@ def _prepare(pipeline: Pipeline, volume: Any, transfer: Any) -> tuple[Any, Any, 
 @partial(jax.jit, static_argnums=0)
 def _count(tracer: AbstractTracer, scene: Any, origins: Array, directions: Array) -> Any:
     """Nodes, as many as segments or more, and status of R rays."""
-    rays = tracer.prepare_rays(scene, origins, directions)
+    rays = tracer.prepare_rays(scene, Rays(origins, directions))
     found = record(tracer, scene, jax.tree.map(lambda x: x[None], rays))
     return tuple(x[0] for x in found)
 
@@ -203,7 +205,7 @@ def _walk(pipeline: Pipeline, most: int, scene: Any, table: Any, origins: Any, d
     """Number of segments (R,), then of each, (R, most, ...): cell, distance of the back, length,
     scalars and contribution."""
     tracer, compositor = pipeline.tracer, pipeline.compositor
-    rays = tracer.prepare_rays(scene, origins, directions)
+    rays = tracer.prepare_rays(scene, Rays(origins, directions))
     operands = Operands(scene, rays, table)
     size, dtype = origins.shape[0], origins.dtype
     lane = jnp.arange(size)

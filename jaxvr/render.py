@@ -32,6 +32,7 @@ from jaxvr.adjoint.replay import settle
 from jaxvr.arguments import (
     adjoint_of,
     background_of,
+    between,
     camera_of,
     compositor_of,
     dtype_of,
@@ -48,9 +49,10 @@ from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.trace import AbstractTracer, Recorded, Segments
 from jaxvr.trace.beam import are_rays
 from jaxvr.trace.integrity import unfit
-from jaxvr.trace.recorded import Nodes, fill, record
-from jaxvr.units import mesh_in, transfer_in, units_of
+from jaxvr.trace.recorded import Nodes, Runs, fill, record
+from jaxvr.units import mesh_in, rays_in, transfer_in, units_of
 from jaxvr.view.camera import Camera
+from jaxvr.view.rays import Rays, flat
 from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
 from jaxvr.volume.integrity import hold, unasked
 from jaxvr.volume.mesh import TetMesh
@@ -186,6 +188,8 @@ def render_rays(
     directions: Any,
     transfer: TransferFunction | None,
     *,
+    near: Any = None,
+    far: Any = None,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
@@ -203,6 +207,8 @@ def render_rays(
     directions: Any,
     transfer: TransferFunction | None,
     *,
+    near: Any = None,
+    far: Any = None,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
@@ -220,6 +226,8 @@ def render_rays(
     directions: Any,
     transfer: TransferFunction | None,
     *,
+    near: Any = None,
+    far: Any = None,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
@@ -236,6 +244,8 @@ def render_rays(
     directions: Any,
     transfer: TransferFunction | None,
     *,
+    near: Any = None,
+    far: Any = None,
     tracer: AbstractTracer | None = None,
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
@@ -251,19 +261,25 @@ def render_rays(
         the world: beside a volume that has an `origin` pass NumPy's float64.
         Directions of any length but zero: optical lengths are world lengths. Neighbours in the
         array should be neighbours in space, for speed.
+      near, far: world distances from the origins, numbers or (...,): of each ray what lies between
+        them is seen, cut there inside of cells too. None for 0 and for no end. What is before the
+        origin is never seen, so that a `near` below 0 is 0; nothing is where `far` is below `near`.
+        A ray stops at `far`, which saves time unless the mesh has folded cells.
       status: also return the status bits (...,) int32 of each ray, for `jaxvr.check`.
       The rest as for `render`.
 
     Returns:
-      rgba (..., 4), premultiplied linear, in the volume's dtype. Differentiable in origins and
-      directions too.
+      rgba (..., 4), premultiplied linear, in the volume's dtype. Differentiable in origins,
+      directions, near and far too: by the latter two the light that comes from there, one-sided
+      where they lie on a face between two cells whose values differ. Silhouettes are left out: of
+      an alpha that steps, as those of `XRay` and `MaximumIntensity`, nothing is said.
     """
     pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
-    origins, directions = rays_of(origins, directions, volume_of(volume))
+    rays = rays_of(origins, directions, volume_of(volume), near, far)
     transfer = transfer_of(transfer, volume, pipeline.compositor)
     how = _how(pipeline, adjoint, budget, volume)
     with refusing(how[1]):
-        scene = bare(volume), origins, directions, bare(transfer)
+        scene = bare(volume), rays, bare(transfer)
         last = offset_of(volume), background_of(background)
         rgba, bits = _render_rays(*how, *scene, *last)
     bits = hold(volume, bits)
@@ -278,6 +294,8 @@ def trace(
     volume: TetMesh,
     camera: Camera | tuple[Any, Any],
     *,
+    near: Any = None,
+    far: Any = None,
     tracer: AbstractTracer | None = None,
     budget: int | None = None,
     native: bool | None = None,
@@ -286,6 +304,7 @@ def trace(
 
     Args:
       camera: a camera, or rays (origins, directions) with shapes (..., 3).
+      near, far: as for `render_rays`; of a camera numbers or (height, width).
       budget: as for `render`.
       native: whether to use compiled loops (see `jaxvr.native`); None for where they can be used.
 
@@ -304,19 +323,19 @@ def trace(
     if isinstance(camera, Camera):
         camera = camera_of(camera, volume)
         shape, order = (camera.height, camera.width), tile_order(camera.height, camera.width)
-        origins, directions = (x.reshape(-1, 3)[order] for x in camera.local_rays())
+        rays = between(*camera.local_rays(), near, far)
     else:
-        origins, directions = rays_of(*camera, volume)
-        shape, order = origins.shape[:-1], np.arange(origins.size // 3)
-        origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+        rays = rays_of(*camera, volume, near, far)
+        shape, order = rays.origins.shape[:-1], np.arange(rays.origins.size // 3)
+    rays = jax.tree.map(lambda x: x[order], flat(rays))
     how = (tracer, compiled.covers(native, volume.dtype, tracer), _batch_size(budget, volume))
     offset, volume = volume.offset, bare(volume)
-    counts, status = _count(*how, volume, origins, directions)
+    counts, status = _count(*how, volume, rays)
     check(status)
     # Rays of like length together: then no ray of a batch waits for the others when shaded.
     by_length = np.argsort(np.asarray(counts), kind="stable")
     counts, status, order = np.asarray(counts)[by_length], status[by_length], order[by_length]
-    origins, directions = origins[by_length], directions[by_length]
+    rays = jax.tree.map(lambda x: x[by_length], rays)
     start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     if start[-1] >= 2**31:
         raise ValueError(f"{start[-1]} nodes do not fit 32-bit indices. Trace fewer rays at once.")
@@ -324,7 +343,7 @@ def trace(
     unit = 1 << max(int(start[-1]).bit_length() - 3, 10)
     total = -(-max(int(start[-1]), 1) // unit) * unit
     runs = start[:-1].astype(np.int32)
-    nodes = _fill(*how, volume, origins, directions, runs, total)
+    nodes = _fill(*how, volume, rays, runs, total)
     return Segments(
         nodes.scalar,
         nodes.length,
@@ -392,21 +411,18 @@ def _render(pipeline, adjoint, size, volume, camera, transfer, offset, backgroun
     # Under a user's own jit operands may be constants: XLA must not compute with them itself.
     volume, camera = lax.optimization_barrier((volume, camera))
     height, width = camera.height, camera.width
-    origins, directions = (tile(x) for x in camera.local_rays())
-    rgba, status = _run(pipeline, adjoint, size, volume, origins, directions, transfer, offset)
+    rays = Rays(*(tile(x) for x in camera.local_rays()))
+    rgba, status = _run(pipeline, adjoint, size, volume, rays, transfer, offset)
     seen = lax.stop_gradient(rgba[:, 3]).max()  # for `hints`; a background hides it
     rgba = _over(untile(rgba, height, width), background)
     return rgba, untile(status[:, None], height, width)[..., 0], seen
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _render_rays(
-    pipeline, adjoint, size, volume, origins, directions, transfer, offset, background
-):
-    shape = origins.shape[:-1]
-    volume, origins, directions = lax.optimization_barrier((volume, origins, directions))
-    rays = (origins.reshape(-1, 3), directions.reshape(-1, 3))
-    rgba, status = _run(pipeline, adjoint, size, volume, *rays, transfer, offset)
+def _render_rays(pipeline, adjoint, size, volume, rays, transfer, offset, background):
+    shape = rays.origins.shape[:-1]
+    volume, rays = lax.optimization_barrier((volume, rays))
+    rgba, status = _run(pipeline, adjoint, size, volume, flat(rays), transfer, offset)
     return _over(rgba, background).reshape(*shape, 4), status.reshape(shape)
 
 
@@ -422,10 +438,10 @@ def _shade(pipeline, adjoint, size, segments, transfer, offset, background):
     transfer = transfer_in(units, transfer)
     scene = pipeline.tracer.prepare(segments)
     # A batch is filled up with runs that are empty: a copy would add to the last run's gradient.
-    rays, count = batches(size, (segments.start[:-1], segments.start[1:]))
-    number = np.arange(rays[0].size).reshape(rays[0].shape)
-    rays = (rays[0], jnp.where(number < count, rays[1], rays[0]))
-    rays = pipeline.tracer.prepare_rays(scene, *rays)
+    runs, count = batches(size, Runs(segments.start[:-1], segments.start[1:]))
+    number = np.arange(runs.first.size).reshape(runs.first.shape)
+    runs = Runs(runs.first, jnp.where(number < count, runs.end, runs.first))
+    rays = pipeline.tracer.prepare_rays(scene, runs)
     scale = Scale(units.scalar, units.length, offset)
     rgba = _finish(pipeline, adjoint, scene, rays, transfer, scale, count)[0]
     rgba = jnp.zeros_like(rgba).at[segments.order].set(rgba, unique_indices=True)
@@ -433,24 +449,24 @@ def _shade(pipeline, adjoint, size, segments, transfer, offset, background):
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _count(tracer, native, size, volume, origins, directions):
+def _count(tracer, native, size, volume, rays):
     units = units_of(volume.points, volume.values)
-    volume, origins = mesh_in(units, volume), origins * units.length
+    volume, rays = mesh_in(units, volume), rays_in(units, rays)
     scene = tracer.prepare(volume)
-    rays, count = batches(size, (origins, directions))
-    rays = jax.vmap(partial(tracer.prepare_rays, scene))(*rays)
+    rays, count = batches(size, rays)
+    rays = jax.vmap(partial(tracer.prepare_rays, scene))(rays)
     found = compiled.kernels.count_nodes(scene, rays) if native else record(tracer, scene, rays)
     number, status = (x.reshape(-1)[:count] for x in found)
     return number, status | units.status
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 7))
-def _fill(tracer, native, size, volume, origins, directions, start, total):
+@partial(jax.jit, static_argnums=(0, 1, 2, 6))
+def _fill(tracer, native, size, volume, rays, start, total):
     units = units_of(volume.points, volume.values)
-    volume, origins = mesh_in(units, volume), origins * units.length
+    volume, rays = mesh_in(units, volume), rays_in(units, rays)
     scene = tracer.prepare(volume)
-    (origins, directions, starts), _ = batches(size, (origins, directions, start))
-    rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
+    (rays, starts), _ = batches(size, (rays, start))
+    rays = jax.vmap(partial(tracer.prepare_rays, scene))(rays)
     if native:
         nodes = compiled.kernels.fill_nodes(scene, rays, start, total)
     else:
@@ -458,17 +474,21 @@ def _fill(tracer, native, size, volume, origins, directions, start, total):
     return Nodes(nodes.scalar / units.scalar, nodes.length / units.length)
 
 
-def _run(pipeline, adjoint, size, volume, origins, directions, transfer, offset):
-    """rgba (R, 4) and status (R,) of rays (R, 3)."""
+def _run(pipeline, adjoint, size, volume, given, transfer, offset):
+    """rgba (R, 4) and status (R,) of R rays."""
     units = units_of(volume.points, volume.values, transfer.positions)
-    volume, origins = mesh_in(units, volume), origins * units.length
+    volume, given = mesh_in(units, volume), rays_in(units, given)
     transfer = transfer_in(units, transfer)
     scene = pipeline.tracer.prepare(volume)
-    rays, count = batches(size, (origins, directions))
-    rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(*rays)
+    rays, count = batches(size, given)
+    rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(rays)
     scale = Scale(units.scalar, units.length, offset)
     rgba, status = _finish(pipeline, adjoint, scene, rays, transfer, scale, count)
-    status = jnp.where(are_rays(origins.T, directions.T), status, status | LOST)
+    good = are_rays(given.origins.T, given.directions.T)
+    for end in (given.near, given.far):
+        if end is not None:
+            rgba = jnp.where(jnp.isnan(end)[:, None], jnp.nan, rgba)
+    status = jnp.where(good, status, status | LOST)
     good = _in_range(volume, getattr(adjoint, "native", False))
     return rgba, jnp.where(good, status, BROKEN) | units.status
 

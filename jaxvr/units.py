@@ -31,6 +31,7 @@ from jax import lax
 from jaxvr._core.status import LENGTHS, SCALARS, UNSORTED
 from jaxvr._core.units import exponent_of, is_large, is_none, is_small, power_of_two, times_told
 from jaxvr.optics import TransferFunction
+from jaxvr.view.rays import Rays
 
 Array = jax.Array
 
@@ -88,6 +89,12 @@ def mesh_in(units: Units, volume: Any) -> Any:
     return dataclasses.replace(
         volume, points=volume.points * units.length, values=units.of_scalars(volume.values)
     )
+
+
+def rays_in(units: Units, rays: Rays) -> Rays:
+    """Rays in such units."""
+    near, far = (None if x is None else x * units.length for x in (rays.near, rays.far))
+    return Rays(rays.origins * units.length, rays.directions, near, far)
 
 
 def transfer_in(units: Units, transfer: TransferFunction) -> TransferFunction:

@@ -51,7 +51,7 @@ STATIC = {
         "_render_rays": (0, 1, 2),
         "_shade": (0, 1, 2),
         "_count": (0, 1, 2),
-        "_fill": (0, 1, 2, 7),
+        "_fill": (0, 1, 2, 6),
     },
     "jaxvr.probe": {"_prepare": (0,), "_count": (0,), "_walk": (0, 1)},
     "jaxvr.trace.measure": {"_measure": (0, 1)},

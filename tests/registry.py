@@ -7,12 +7,18 @@ rules out, and nothing else.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import jax
 import numpy as np
+import quick
 
 import jaxvr
+from jaxvr.adjoint import Pipeline
+from jaxvr.adjoint.base import Operands
+from jaxvr.arguments import rays_of
 from jaxvr.volume import datasets
 
 
@@ -144,3 +150,20 @@ def combinations() -> Iterator[tuple[Entry, Entry, Entry, str]]:
             for adjoint in (ADJOINTS[0], ADJOINTS[-1]):
                 if not integrator.variant and adjoint.can(integrator):
                     yield tracer, integrator, adjoint, "point"
+
+
+def states(mesh, rays, transfer, compositor, adjoint, near, far):
+    """The compositor's state at the end of rays (origins, directions) (R, 3): leaves (..., R)."""
+    given = rays_of(*rays, mesh, near, far)
+    state, status = _states(compositor, adjoint, mesh, given, transfer)
+    assert not np.asarray(status).any()
+    return jax.tree.map(lambda x: x[0], state)
+
+
+@functools.partial(quick.jit, static_argnums=(0, 1))
+def _states(compositor, adjoint, mesh, rays, transfer):
+    tracer, integrator = jaxvr.RayCast(), compositor.default_integrator()
+    scene = tracer.prepare(mesh)
+    batch = jax.tree.map(lambda x: x[None], tracer.prepare_rays(scene, rays))
+    table = integrator.prepare(transfer, mesh.dtype, tracer.longest(scene))
+    return adjoint.run(Pipeline(tracer, integrator, compositor), Operands(scene, batch, table))

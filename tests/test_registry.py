@@ -187,6 +187,13 @@ def test_shaded_back_to_front(integrator, adjoint, location):
     compare(found, same, same, ENTRIES["Analytic"])
 
 
+@pytest.mark.parametrize("tracer", ["RayCast", "KBuffer"])
+def test_back_to_front(tracer):
+    found = derivative(tracer, "Analytic", "Replay", "corner", True, "backwards")
+    same = derivative("RayCast", "Analytic", "compiled", "corner", True)
+    compare(found, same, same, ENTRIES["Analytic"])
+
+
 @pytest.mark.parametrize("adjoint", registry.ADJOINTS, ids=lambda x: x.name)
 @pytest.mark.parametrize("how", ["render", "shade"])
 def test_all_adjoints_end_rays_at_the_same_places(how, adjoint):

@@ -75,7 +75,7 @@ class Over(AbstractCompositor):
 
     direction: "front to back", or "back to front" as projected cells are composited: the same image
     and gradients to rounding, and no faster. It asks for a tracer that can stream segments from
-    behind: `shade` can, of tracers those with a way to be `reversed`, and `RayCast` cannot.
+    behind, by `reversed`: all of the package's can.
 
     Raises:
       ValueError: if `termination` is not a number in [0, 1), for another direction, and for both at

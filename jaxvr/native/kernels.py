@@ -88,7 +88,7 @@ def pull_back(
         rows,
         Shape((points if by_values or by_points else 0, 4), dtype),
         sized(mesh.values, (by_values or by_points) and not at_points),
-        Shape((6, count if by_rays else 0), dtype),
+        Shape((8, count if by_rays else 0), dtype),
     ]
     table_bar, vertices, values, by_ray = _call("render_pull", dtype, shapes)(*operands)
     values = vertices[:, 3] if at_points else values
@@ -97,6 +97,9 @@ def pull_back(
         vertices[:, :3].T.reshape(-1) if by_points else None,
     )
     rays_bar = tuple(x.reshape(rays.origin_x.shape) for x in by_ray) if by_rays else None
+    if rays_bar is not None:
+        ends = zip((rays.near, rays.far), rays_bar[6:], strict=True)
+        rays_bar = (*rays_bar[:6], *(None if x is None else bar for x, bar in ends))
     return scene_bar, rays_bar, table_bar if ask_table else None
 
 
@@ -135,9 +138,19 @@ def _world(scene: Any, rays: Any) -> tuple[tuple[Any, ...], int]:
         *(mesh.vertices, mesh.values, mesh.cells, mesh.neighbors),
         *(scene.boxes.low, scene.boxes.high, mesh.faces),
         *(jnp.stack([x.reshape(-1) for x in rows]) for rows in (axes, numbers)),
+        _bounds(rays),
         np.array([LOCATIONS[mesh.location], mesh.seams], np.int32),
     )
     return arrays, rays.origin_x.size
+
+
+def _bounds(rays: ShearedRays) -> Array:
+    """near, far and stop (3, N), or (3, 0) for rays that have none of them."""
+    like = rays.origin_x.reshape(-1)
+    if rays.near is None and rays.far is None:
+        return jnp.zeros((3, 0), like.dtype)
+    given = ((rays.near, 0), (rays.far, jnp.inf), (rays.stop, jnp.inf))
+    return jnp.stack([jnp.full_like(like, d) if x is None else x.reshape(-1) for x, d in given])
 
 
 def _dtype_of(scene: Any) -> Any:

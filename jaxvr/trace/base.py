@@ -66,8 +66,9 @@ class AbstractTracer(abc.ABC):
         """A bound () on the length of a segment, for integrators whose tables end somewhere."""
 
     @abc.abstractmethod
-    def prepare_rays(self, scene: Any, origins: Array, directions: Array) -> Any:
-        """Arrays (R,) of what steps need of the rays (R, 3), differentiable."""
+    def prepare_rays(self, scene: Any, rays: Any) -> Any:
+        """Arrays (R,) of what steps need of `Rays`, differentiable: `near` and `far` too, at which
+        the tracer cuts its segments off."""
 
     @abc.abstractmethod
     def start(self, scene: Any, rays: Any) -> Any:

@@ -79,13 +79,14 @@ from jaxvr.trace.faces import CellFaces, cell_faces
 from jaxvr.trace.local import (
     ROUNDING,
     Between,
+    Side,
     as_rays,
     as_scene,
     crossing_of_face,
     gradient_zeros,
-    is_behind,
     pull_back_pair,
     segment_from,
+    side_of,
 )
 from jaxvr.trace.path import Choice, deepest, follow, untangle
 from jaxvr.trace.scene import Scene, entry_corners, longest_edge, make_scene, values_at
@@ -102,6 +103,7 @@ from jaxvr.trace.stream import (
     start_stream,
     tolerance,
 )
+from jaxvr.view.rays import Rays
 from jaxvr.volume import packing
 
 Array = jax.Array
@@ -203,13 +205,14 @@ class KBuffer(AbstractTracer):
     def longest(self, scene: CellFaces) -> Array:
         return longest_edge(scene.scene)
 
-    def prepare_rays(self, scene: CellFaces, origins: Array, directions: Array) -> BeamRays:
-        return beam_rays(origins, directions, scene.scene.scale)
+    def prepare_rays(self, scene: CellFaces, rays: Rays) -> BeamRays:
+        return beam_rays(rays, scene.scene.scale)
 
     def start(self, scene: CellFaces, rays: BeamRays) -> BufferState:
         dtype, count = rays.origins.dtype, rays.origins.shape[1]
         zero, no = jnp.zeros(count, dtype), jnp.zeros(count, bool)
         integer, rows = jnp.zeros(count, jnp.int32), (self.k + 1, count)
+        inside = Side(no, None if rays.sheared.far is None else no)
         values = 1 if one_value(scene.scene) else 2
         # Points without a place may be behind any segment that is missing, not a small k.
         broken = ~jnp.all(jnp.isfinite(jnp.stack(scene.boxes)))
@@ -230,7 +233,7 @@ class KBuffer(AbstractTracer):
             seen_from=(no, no),
             owed=(integer - 1, zero),
             wrong=wrong,
-            faces=Between(integer, integer, integer, no, no, (no, no)),
+            faces=Between(integer, integer, integer, no, no, (inside, inside)),
             begun=no,
             segment=Segment(zero, zero, zero),
             active=no,
@@ -485,11 +488,11 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
         start = _start(state, chosen, onward, how)
         # Which way a ring is run through is not known: by depth.
         backwards = found & (packing.turned_of(words[0]) == 1) & ~ringed
-    stretch = rays.sheared.stretch
-    segment, after = segment_from(start.at, one, two, start.cut, backwards, stretch)
+    interval = rays.sheared.interval
+    segment, after = segment_from(start.at, one, two, start.cut, backwards, interval)
     at = choose(start.cut, start.at, one)
-    behind = is_behind((at.z, at.z_low)), is_behind(after.depth)
-    faces = Between(*words, start.word, start.cut, backwards, behind)
+    sides = side_of((at.z, at.z_low), interval), side_of(after.depth, interval)
+    faces = Between(*words, start.word, start.cut, backwards, sides)
 
     inside, outside = found, state.outside
     if not by_cells:
@@ -499,14 +502,19 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
     begin, end = lax.stop_gradient(at.z), lax.stop_gradient(two.z)
     # A segment of no length has a derivative, where that is not a matter of more than rounding: so
     # has one that ends at the eye, which the next makes up for.
-    flat = (segment.length == 0) & (after.lead == 0) & (jnp.maximum(begin, end) >= 0)
+    unseen = sides[0].before & sides[1].before
+    if sides[0].beyond is not None:
+        unseen = unseen | (sides[0].beyond & sides[1].beyond)
+    flat = (segment.length == 0) & (after.lead == 0) & ~unseen
     given = inside & ((segment.length > 0) | flat)
 
     buffer, left, drop = forget(buffer, first.words, pair, give, found, by_cells)
     buffer = settle(buffer, pair.first, drop, go & ~give, count)
     count = count - drop.astype(jnp.int32)
     slack = tolerance(end, rays.sheared)
-    solid = given & (lax.stop_gradient(segment.length) > slack * lax.stop_gradient(stretch))
+    solid = given & (
+        lax.stop_gradient(segment.length) > slack * lax.stop_gradient(interval.stretch)
+    )
     if by_cells:
         state = _in_order(state, chosen, faces, (begin, end), solid, slack, how)
         state = _hold(state, chosen, start, after, faces, onward, give, how)

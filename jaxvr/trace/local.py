@@ -46,7 +46,7 @@ from jaxvr.trace.face import (
     sum_of,
 )
 from jaxvr.trace.scene import Scene, entry_corners, fetch, points_at, value_slots
-from jaxvr.trace.shear import VALUE, ShearedRays, X, Y, Z
+from jaxvr.trace.shear import VALUE, Interval, ShearedRays, X, Y, Z
 from jaxvr.volume import packing
 
 Array = jax.Array
@@ -115,6 +115,14 @@ def _moving_as_jvp(primals, tangents):
     return primals[0], tangents[1]
 
 
+class Side(NamedTuple):
+    """Whether depths lie outside of a ray's interval, (R,) each: before its near end, and beyond
+    its far end, None if it has none."""
+
+    before: Array
+    beyond: Array | None
+
+
 class Reached(NamedTuple):
     """How far a ray has come: depth (2, R), a pair, and by how much that is farther (R,) than the
     face it stands in; 0 unless that face lies farther back than rounding explains."""
@@ -123,16 +131,23 @@ class Reached(NamedTuple):
     lead: Array
 
 
-def is_behind(depth: Any) -> Array:
-    """Whether a depth (2, R), a pair, lies behind the eye."""
-    return depth[0] + depth[1] < 0
+def side_of(depth: Any, interval: Interval) -> Side:
+    """Where a depth (2, R), a pair, lies."""
+    z = depth[0] + depth[1]
+    near, far, _ = interval
+    return Side(z < (0 if near is None else near), None if far is None else z > far)
 
 
 def make_segment(
-    reached: Reached, front: Array, out: Crossing, turned: Array, stretch: Array, behind: Any = None
+    reached: Reached,
+    front: Array,
+    out: Crossing,
+    turned: Array,
+    interval: Interval,
+    sides: tuple[Side, Side] | None = None,
 ):
-    """The segment from where a ray has come to up to the exit, with what lies behind the eye cut
-    off, and how far the ray has come then. front (R,): the scalar at the entry face.
+    """The segment from where a ray has come to up to the exit, with what lies outside of the ray's
+    interval cut off, and how far the ray has come then. front (R,): the scalar at the entry face.
 
     An exit before the depth reached ends a segment of no length: the ray stays where it is, so that
     chords add up to the distance from the first face to the last. The next segment then starts
@@ -145,9 +160,9 @@ def make_segment(
     made of the cell. Where a cell is overturned for good, the depth reached is still that of an
     earlier face, and moves with it.
 
-    behind: whether the two ends lie behind the eye, (R,) each, where that was found before. A face
-    at the eye ends one segment and starts another. Made anew for derivatives, its depth is rounded
-    in another way for each of the two, and neither may have its derivative then.
+    sides: where the two ends lie, where that was found before. A face at the eye, or at another end
+    of the interval, ends one segment and starts another. Made anew for derivatives, its depth is
+    rounded in another way for each of the two, and neither may have its derivative then.
     """
     depth, lead = reached
     advance = (out.z - depth[0]) + (out.z_low - depth[1])
@@ -163,23 +178,35 @@ def make_segment(
     share = jnp.clip(jnp.where(cut, lead, 0) / jnp.where(whole == 0, 1, whole), 0, 1)
     front = jnp.where(cut, front + (out.value - front) * share, front)
     after = Reached(end, jnp.where(near, 0, -advance))
-    behind = (is_behind(depth), is_behind(end)) if behind is None else behind
-    return _clip_at_eye(depth, end, front, out.value, chord, stretch, behind), after
+    sides = (side_of(depth, interval), side_of(end, interval)) if sides is None else sides
+    return _within(interval, depth, end, front, out.value, chord, sides), after
 
 
-def _clip_at_eye(start, end, front: Array, back: Array, chord, stretch, behind) -> Segment:
-    """The part of a segment at depths above zero, as a world length."""
-    z_0, z_1 = start[0] + start[1], end[0] + end[1]
-    begins, ends = behind
-    cuts = begins != ends
-    whole = jnp.where(cuts & (z_0 != z_1), z_1 - z_0, 1.0)
-    at_eye = front + (back - front) * (-z_0 / whole)
-    seen = jnp.where(begins, z_1, z_0)
-    length = jnp.where(cuts, seen, jnp.where(begins, 0.0, chord))
+def _within(interval: Interval, start, end, front: Array, back: Array, chord, sides) -> Segment:
+    """The part of a segment in an interval, as a world length. A hard cut: its place moves."""
+    z = start[0] + start[1], end[0] + end[1]
+    begins, ends = sides
+    near = jnp.zeros_like(z[0]) if interval.near is None else interval.near
+    outside, cut, at = begins.before & ends.before, [s.before for s in sides], [near, near]
+    if interval.far is not None:
+        outside = outside | (begins.beyond & ends.beyond)
+        cut = [s.before | s.beyond for s in sides]
+        at = [jnp.where(s.before, near, interval.far) for s in sides]
+    cut = [c & ~outside for c in cut]
+    cuts = cut[0] | cut[1]
+    whole = jnp.where(cuts & (z[0] != z[1]), z[1] - z[0], 1.0)
+    # Guarded: an end that nothing is cut at may be infinite.
+    at = [jnp.where(c, a, z[0]) for c, a in zip(cut, at, strict=True)]
+    scalars = [front + (back - front) * ((a - z[0]) / whole) for a in at]
+    first, last = (jnp.where(*x) for x in zip(cut, at, z, strict=True))
+    # A segment that runs backwards comes in at the far end, or goes out at the near one.
+    backwards = ends.before if interval.far is None else ends.before | begins.beyond
+    seen = jnp.where(backwards, first - last, last - first)
+    length = jnp.where(cuts, seen, jnp.where(outside, 0.0, chord))
     return Segment(
-        jnp.where(cuts & begins, at_eye, front),
-        jnp.where(cuts & ends, at_eye, back),
-        length * stretch,
+        jnp.where(cut[0], scalars[0], front),
+        jnp.where(cut[1], scalars[1], back),
+        length * interval.stretch,
     )
 
 
@@ -230,7 +257,8 @@ def gradient_zeros(scene: Scene, rays: ShearedRays, asked: Scene, by_rays: bool)
         jnp.zeros_like(scene.values) if asked.values else None,
         jnp.zeros_like(scene.coordinates) if asked.coordinates else None,
     )
-    return for_scene, (jnp.zeros_like(rays.origin_x),) * 6 if by_rays else None
+    ends = tuple(None if x is None else jnp.zeros_like(x) for x in (rays.near, rays.far))
+    return for_scene, ((jnp.zeros_like(rays.origin_x),) * 6 + ends) if by_rays else None
 
 
 def as_scene(scene: Scene, gradient: Any) -> Scene:
@@ -249,7 +277,7 @@ def as_rays(rays: ShearedRays, gradient: Any) -> ShearedRays:
     out = jax.tree.map(jnp.zeros_like, rays)
     if gradient is None:
         return out
-    names = ("origin_x", "origin_y", "origin_z", "shear_x", "shear_y", "stretch")
+    names = ("origin_x", "origin_y", "origin_z", "shear_x", "shear_y", "stretch", "near", "far")
     return dataclasses.replace(out, **dict(zip(names, gradient, strict=True)))
 
 
@@ -259,14 +287,14 @@ def segment_from(
     leave: Crossing,
     cut: Array,
     turned: Array,
-    stretch: Array,
-    behind: Any = None,
+    interval: Interval,
+    sides: tuple[Side, Side] | None = None,
 ) -> tuple[Segment, Reached]:
     """`make_segment` of a cell between two crossings, from a third on where it is `cut` (R,)."""
     start = choose(cut, start, enter)
     lead = jnp.where(cut, (start.z - enter.z) + (start.z_low - enter.z_low), 0)
     reached = Reached(jnp.stack([start.z, start.z_low]), lead)
-    return make_segment(reached, enter.value, leave, turned, stretch, behind)
+    return make_segment(reached, enter.value, leave, turned, interval, sides)
 
 
 def pull_back_cell(
@@ -285,17 +313,17 @@ def pull_back_cell(
     cut = live & (cell.lead != 0)
     before = jnp.where(cut, cell.reached, cell.word)
     start = once(jnp.any(cut), _start_at, enter, scene, rays, before, cut)
-    behind = cell.behind, is_behind(ahead.depth)
+    sides = cell.side, side_of(ahead.depth, rays.interval)
 
-    def pull_back_segment(enter, start, leave, stretch, bar):
-        def forward(enter, start, leave, stretch):
-            return segment_from(start, enter, leave, cut, turned, stretch, behind)[0]
+    def pull_back_segment(enter, start, leave, interval, bar):
+        def forward(enter, start, leave, interval):
+            return segment_from(start, enter, leave, cut, turned, interval, sides)[0]
 
-        return jax.vjp(forward, enter, start, leave, stretch)[1](bar)
+        return jax.vjp(forward, enter, start, leave, interval)[1](bar)
 
     cotangent = Segment(*(jnp.where(live, g, 0) for g in cotangent))
-    enter_bar, start_bar, leave_bar, stretch_bar = stage(
-        wanted, pull_back_segment, enter, start, leave, rays.stretch, cotangent
+    enter_bar, start_bar, leave_bar, interval_bar = stage(
+        wanted, pull_back_segment, enter, start, leave, rays.interval, cotangent
     )
     area, exit_area = sum_of(cell.weights), sum_of(ahead.weights)
     area = jnp.where(cell.positive, area, -area)
@@ -315,7 +343,7 @@ def pull_back_cell(
 
     if coordinates is not None:
         coordinates = _to_points(coordinates, rays, ids, shares, q, p)
-    by_rays = _to_rays(by_rays, rays, (q, enter), (p, leave), stretch_bar)
+    by_rays = _to_rays(by_rays, rays, (q, enter), (p, leave), interval_bar)
     moved = (coordinates, by_rays)
     moved = once(jnp.any(cut), _pull_back_start, moved, scene, rays, before, cut, start_bar.z)
     return (values, moved[0]), moved[1]
@@ -335,7 +363,8 @@ def _pull_back_start(moved: Any, scene: Scene, rays: ShearedRays, word: Array, c
     if coordinates is not None:
         shares = [(share, zero) for share in end.share]
         coordinates = _to_points(coordinates, rays, end.ids, shares, q, none)
-    return coordinates, _to_rays(by_rays, rays, (q, end.at), (none, end.at), zero)
+    still = jax.tree.map(jnp.zeros_like, rays.interval)
+    return coordinates, _to_rays(by_rays, rays, (q, end.at), (none, end.at), still)
 
 
 def _in_space(rays: ShearedRays, v: _Pulled) -> tuple[Array, Array, Array]:
@@ -352,8 +381,9 @@ def _to_points(coordinates: Array, rays: ShearedRays, ids: Array, shares: Any, q
     return coordinates.at[jnp.concatenate(where)].add(jnp.concatenate(bars))
 
 
-def _to_rays(by_rays: Any, rays: ShearedRays, first: Any, second: Any, stretch_bar: Array) -> Any:
-    """Adds what the ray gets of two crossings, each with what was pulled back to its face."""
+def _to_rays(by_rays: Any, rays: ShearedRays, first: Any, second: Any, bar: Interval) -> Any:
+    """Adds what the ray gets of two crossings, each with what was pulled back to its face, and of
+    its interval."""
     if by_rays is None:
         return None
     (q, enter), (p, leave) = first, second
@@ -361,22 +391,21 @@ def _to_rays(by_rays: Any, rays: ShearedRays, first: Any, second: Any, stretch_b
     origin = tuple(-(g + h) for g, h in in_space)
     shear_x = -rays.sign * (q.x * enter.z + p.x * leave.z)
     shear_y = -rays.sign * (q.y * enter.z + p.y * leave.z)
-    change = (*origin, shear_x, shear_y, stretch_bar)
-    return tuple(g + c for g, c in zip(by_rays, change, strict=True))
+    change = (*origin, shear_x, shear_y, bar.stretch, bar.near, bar.far)
+    return tuple(None if g is None else g + c for g, c in zip(by_rays, change, strict=True))
 
 
 class Between(NamedTuple):
     """The faces of a segment, as words of cell and corner (R,): enter and leave, in the order of
     the path; start, where it is cut (R,), that in whose depth it starts; turned (R,): whether the
-    path leads back from one to the other; behind: whether start and end lie behind the eye, (R,)
-    each."""
+    path leads back from one to the other; sides: where start and end lie."""
 
     enter: Array
     leave: Array
     start: Array
     cut: Array
     turned: Array
-    behind: tuple[Array, Array]
+    sides: tuple[Side, Side]
 
 
 def pull_back_pair(
@@ -401,16 +430,16 @@ def pull_back_pair(
     before = jnp.where(cut, faces.start, 0)
     start = once(jnp.any(cut), _start_at, ends[0].at, scene, rays, before, cut)
 
-    def pull_back_segment(enter, start, leave, stretch, bar):
-        def forward(enter, start, leave, stretch):
-            made = segment_from(start, enter, leave, cut, faces.turned, stretch, faces.behind)
+    def pull_back_segment(enter, start, leave, interval, bar):
+        def forward(enter, start, leave, interval):
+            made = segment_from(start, enter, leave, cut, faces.turned, interval, faces.sides)
             return made[0]
 
-        return jax.vjp(forward, enter, start, leave, stretch)[1](bar)
+        return jax.vjp(forward, enter, start, leave, interval)[1](bar)
 
     cotangent = Segment(*(jnp.where(live, g, 0) for g in cotangent))
-    enter_bar, start_bar, leave_bar, stretch_bar = stage(
-        wanted, pull_back_segment, ends[0].at, start, ends[1].at, rays.stretch, cotangent
+    enter_bar, start_bar, leave_bar, interval_bar = stage(
+        wanted, pull_back_segment, ends[0].at, start, ends[1].at, rays.interval, cotangent
     )
     pulled = [
         stage(wanted, _pull_back_crossing, end.face, end.area, bar.z, bar.value)
@@ -425,7 +454,7 @@ def pull_back_pair(
             shares = [(share, jnp.zeros_like(share)) for share in end.share]
             coordinates = _to_points(coordinates, rays, end.ids, shares, q, none)
     first, second = zip(pulled, (end.at for end in ends), strict=True)
-    by_rays = _to_rays(by_rays, rays, first, second, stretch_bar)
+    by_rays = _to_rays(by_rays, rays, first, second, interval_bar)
     moved = (coordinates, by_rays)
     moved = once(jnp.any(cut), _pull_back_start, moved, scene, rays, before, cut, start_bar.z)
     return (values, moved[0]), moved[1]

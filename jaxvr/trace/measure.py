@@ -32,6 +32,7 @@ from jaxvr.trace.scene import make_scene
 from jaxvr.trace.select import Sort
 from jaxvr.trace.stream import beam_rays, draw, tolerance
 from jaxvr.view.camera import Camera
+from jaxvr.view.rays import Rays
 from jaxvr.view.tiles import batch_size, batches, tile, untile
 from jaxvr.volume.integrity import require_mesh
 from jaxvr.volume.mesh import TetMesh
@@ -152,8 +153,7 @@ def _measure(sort: Sort, most: int, source: CellFaces, origins: Array, direction
     size, dtype = origins.shape[1], origins.dtype
 
     def one(inputs):
-        origins, directions = inputs
-        rays = beam_rays(origins, directions, source.scene.scale)
+        rays = beam_rays(Rays(*inputs), source.scene.scale)
         zero, far = jnp.zeros(size, jnp.int32), jnp.full(size, jnp.inf, dtype)
         nothing = _Counts(
             -jnp.broadcast_to(far, (most, size)), (far, zero), zero, (-far, zero), zero

@@ -43,6 +43,7 @@ from jaxvr.trace.select import BLOCK, Sort
 from jaxvr.trace.shear import shear_rays
 from jaxvr.trace.stream import Hits, beam_rays, draw, face_at
 from jaxvr.view.camera import Camera
+from jaxvr.view.rays import Rays
 from jaxvr.view.tiles import batch_size, batches, tile_order
 
 Array = jax.Array
@@ -240,8 +241,7 @@ def _count(sort: Sort, source: Triangles, rays: Any) -> Array:
     rays, count = batches(batch_size(source.vertices.dtype), rays)
 
     def one(inputs):
-        origins, directions = inputs
-        batch = beam_rays(origins, directions, source.scale)
+        batch = beam_rays(Rays(*inputs), source.scale)
         zero = jnp.zeros(batch.origins.shape[1], jnp.int32)
         return draw(source, batch, sort, zero, lambda n, new: n + _ahead(new).astype(jnp.int32))
 
@@ -255,7 +255,7 @@ def _fill(sort: Sort, source: Triangles, rays: Any, start: Array, room: int) -> 
 
     def one(arrays, inputs):
         origins, directions, first = inputs
-        rays = beam_rays(origins, directions, source.scale)
+        rays = beam_rays(Rays(origins, directions), source.scale)
 
         def add(carry, new):
             place, (faces, depths, scalars) = carry
@@ -294,7 +294,7 @@ def beside(points: Any, camera: Camera, origin: Any) -> tuple[Any, Camera]:
 def _locate(fragments: Fragments, points: Array, values: Array, camera: Camera) -> Any:
     source = triangle_source(points, values, fragments.triangles)
     origins, directions = (x.reshape(-1, 3)[fragments.pixel] for x in camera.local_rays())
-    rays = shear_rays(origins, directions, source.scale)
+    rays = shear_rays(Rays(origins, directions), source.scale)
     wanted = jnp.ones((), bool)
     face = face_at(source, rays, fragments.face, wanted)
     edges = opposite_edges(*face)

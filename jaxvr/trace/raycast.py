@@ -38,6 +38,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from jaxvr._core import status as bits
 from jaxvr._core.gather import load, take
@@ -50,16 +51,17 @@ from jaxvr.trace.entry import Boxes, Entries, build_boxes, no_entries, search
 from jaxvr.trace.face import Face, choose, crossing, is_positive, opposite_edges, sizes_of
 from jaxvr.trace.local import (
     Reached,
+    Side,
     as_rays,
     as_scene,
     edges_to_apex,
     exit_face,
     gradient_zeros,
     in_order,
-    is_behind,
     leave_by,
     make_segment,
     pull_back_cell,
+    side_of,
 )
 from jaxvr.trace.scene import (
     Scene,
@@ -70,6 +72,7 @@ from jaxvr.trace.scene import (
     values_at,
 )
 from jaxvr.trace.shear import VALUE, ShearedRays, shear_rays
+from jaxvr.view.rays import Rays
 from jaxvr.volume import packing
 from jaxvr.volume.mesh import TetMesh
 
@@ -90,7 +93,7 @@ class Cell(NamedTuple):
     word (R,): packed cell and local index of the apex. positive (R,): sign of the entry face.
     face: its three vertices (4, R). weights (3, R): their barycentric weights. exit_corner (R,):
     local index of the vertex that the exit face does not have. lead, reached: as they were ahead.
-    behind (R,): whether the depth reached ahead lay behind the eye.
+    side: where the depth reached ahead lay.
     """
 
     word: Array
@@ -100,7 +103,7 @@ class Cell(NamedTuple):
     exit_corner: Array
     lead: Array
     reached: Array
-    behind: Array
+    side: Side
 
 
 class Ahead(NamedTuple):
@@ -110,7 +113,7 @@ class Ahead(NamedTuple):
     positive (R,), face, weights (3, R): its sign, vertices and weights, as in a `Cell`.
     depth (2, R), a pair: where the ray crosses it, or how far it has come, if that is farther by
     lead (R,), see `local.Reached`; then reached (R,) is the word of the face where that was.
-    value (R,): the scalar where the ray crosses it.
+    value (R,): the scalar where the ray crosses it; a segment that is cut has another at its back.
     """
 
     word: Array
@@ -148,14 +151,15 @@ class RayCast(AbstractTracer):
     of the image with the order of cells held fixed, which is the gradient wherever it exists: not
     on rays that only touch an edge or a vertex of the boundary. Zero by convention where a ray lies
     in a face's plane.
+
+    reverse: the farthest segments first; an `Over` that composites back to front sets it. A ray
+        from behind is a ray: it comes the other way, and ends at the eye.
     """
 
-    def reversed(self):
-        raise ValueError(
-            "RayCast walks from the eye, so it cannot give the farthest segments first as "
-            "compositing back to front wants them. Use shade(trace(volume, camera), ...), which "
-            "plays segments in either direction, or tracer=KBuffer(); or composite front to back."
-        )
+    reverse: bool = False
+
+    def reversed(self) -> RayCast:
+        return RayCast(not self.reverse)
 
     def prepare(self, volume: TetMesh) -> CastScene:
         scene = make_scene(volume)
@@ -164,8 +168,9 @@ class RayCast(AbstractTracer):
     def longest(self, scene: CastScene) -> Array:
         return longest_edge(scene.mesh)
 
-    def prepare_rays(self, scene: CastScene, origins: Array, directions: Array) -> ShearedRays:
-        return shear_rays(origins, directions, scene.mesh.scale)
+    def prepare_rays(self, scene: CastScene, rays: Rays) -> ShearedRays:
+        sheared = shear_rays(rays.reversed() if self.reverse else rays, scene.mesh.scale)
+        return stopping(scene.mesh, sheared)
 
     def start(self, scene: CastScene, rays: ShearedRays) -> CastState:
         dtype = rays.origin_x.dtype
@@ -174,8 +179,9 @@ class RayCast(AbstractTracer):
         integer = jnp.zeros(count, jnp.int32)
         vertex = jnp.zeros((4, count), dtype)
         face, ones = (vertex, vertex, vertex), jnp.ones((3, count), dtype)
+        none = Side(no, None if rays.far is None else no)
         return CastState(
-            cell=Cell(integer, no, face, ones, integer, zero, integer, no),
+            cell=Cell(integer, no, face, ones, integer, zero, integer, none),
             ahead=Ahead(
                 *(integer, no, face, ones, jnp.zeros((2, count), dtype), zero, zero, integer)
             ),
@@ -192,10 +198,11 @@ class RayCast(AbstractTracer):
     def step(self, scene: CastScene, rays: ShearedRays, state: CastState, move: Array) -> CastState:
         with jax.named_scope("raycast_step"):
             move = move & state.active
-            inside = move & (state.ahead.word >= 0)
+            through = _is_through(rays, state.ahead)
+            inside = move & (state.ahead.word >= 0) & ~through
             gone = move & ~inside
             # A ray that waits for nothing is done.
-            left = (state.entries.face[0] >= 0) | state.entries.more
+            left = ((state.entries.face[0] >= 0) | state.entries.more) & ~through
             active, waiting = state.active & ~gone, state.waiting | (gone & left)
             # Entering is rare and costly, so it waits until no ray of the batch is inside.
             enter = ~jnp.any(active)
@@ -208,7 +215,8 @@ class RayCast(AbstractTracer):
 
     def locate(self, scene: CastScene, rays: ShearedRays, state: CastState) -> tuple[Array, Array]:
         depth = state.ahead.depth[0] + state.ahead.depth[1]
-        return packing.cell_of(state.cell.word), depth * rays.stretch
+        distance = depth * rays.stretch
+        return packing.cell_of(state.cell.word), -distance if self.reverse else distance
 
     def gradient_start(self, scene, rays, perturbed):
         by_rays = any(jax.tree.leaves(perturbed[1]))
@@ -223,6 +231,23 @@ class RayCast(AbstractTracer):
 
     def rays_cotangent(self, rays, gradient):
         return as_rays(rays, gradient)
+
+
+def stopping(scene: Scene, rays: ShearedRays) -> ShearedRays:
+    """Rays that end go no farther, unless cells are folded: there a path comes back."""
+    if rays.far is None:
+        return rays
+    words = jnp.concatenate([scene.neighbors, scene.faces])
+    folded = jnp.any((words >= 0) & (packing.turned_of(words) == 1))
+    stop = jnp.where(folded, jnp.inf, lax.stop_gradient(rays.far))
+    return dataclasses.replace(rays, stop=stop)
+
+
+def _is_through(rays: ShearedRays, ahead: Ahead) -> Array:
+    """Rays (R,) that have come farther than where anything is seen."""
+    if rays.stop is None:
+        return jnp.zeros_like(ahead.positive)
+    return lax.stop_gradient(ahead.depth[0] + ahead.depth[1]) > rays.stop
 
 
 class _Door(NamedTuple):
@@ -310,13 +335,13 @@ def _cross(
     out = stage(wanted, crossing, new_face, new_weights, rays.eye)
     turned = packing.turned_of(word) == 1
     reached = Reached(ahead.depth, ahead.lead)
-    segment, reached = stage(wanted, make_segment, reached, front, out, turned, rays.stretch)
+    segment, reached = stage(wanted, make_segment, reached, front, out, turned, rays.interval)
     lost = moved & leave.lost
     # A ray is in a cell once: one that comes back follows words that belong to no mesh.
     astray = moved & (state.left == 0)
     cell = Cell(
         *(word, ahead.positive, face, ahead.weights, exit_corner),
-        *(ahead.lead, ahead.reached, is_behind(ahead.depth)),
+        *(ahead.lead, ahead.reached, side_of(ahead.depth, rays.interval)),
     )
     active = jnp.where(moved, ~(lost | astray), state.active)
     segment = choose(moved, segment, state.segment)
@@ -328,14 +353,14 @@ def _cross(
             new_face,
             new_weights,
             choose(moved, reached.depth, ahead.depth),
-            jnp.where(moved, segment.back, ahead.value),
+            jnp.where(moved, out.value, ahead.value),
             jnp.where(moved, reached.lead, ahead.lead),
             jnp.where(moved & (ahead.lead == 0), word, ahead.reached),
         ),
         segment=segment._replace(length=jnp.where(active, segment.length, 0)),
         active=active,
         waiting=state.waiting,
-        fresh=moved & (fresh | entered | (segment.front != front)),
+        fresh=moved & (fresh | entered | (segment.front != state.segment.back)),
         status=state.status
         | jnp.where(lost, bits.LOST, 0).astype(jnp.int32)
         | jnp.where(astray, bits.BROKEN, 0).astype(jnp.int32),

@@ -104,9 +104,9 @@ class Recorded(AbstractTracer):
     def longest(self, scene: Nodes) -> Array:
         return jnp.max(scene.length)
 
-    def prepare_rays(self, scene: Nodes, origins: Array, directions: Array) -> Runs:
-        """Here rays are runs of nodes: `origins` their first and `directions` their end nodes."""
-        return Runs(origins, directions)
+    def prepare_rays(self, scene: Nodes, rays: Runs) -> Runs:
+        """Here rays are runs of nodes."""
+        return rays
 
     def start(self, scene: Nodes, rays: Runs) -> PlayState:
         zero = jnp.zeros(rays.first.shape, scene.scalar.dtype)

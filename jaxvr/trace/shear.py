@@ -19,14 +19,25 @@ it is. z is a pair whose sum is exact.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core.pytree import pytree
 from jaxvr.numerics.exact import Halves, halves, head, split, two_product, two_sum
+from jaxvr.view.rays import Rays
 
 Array = jax.Array
+
+
+class Interval(NamedTuple):
+    """What of R rays is seen, and how long it is: near, far and stretch of `ShearedRays`."""
+
+    near: Array | None
+    far: Array | None
+    stretch: Array
 
 
 @pytree
@@ -36,7 +47,9 @@ class ShearedRays:
     axis_x, axis_y, axis_z: int32, the permutation (k_x, k_y, k_z).
     origin_x, origin_y, origin_z: origins in the permuted axes, in the scene's units.
     shear_x, shear_y: S_x, S_y; shear_x_low, shear_y_low: what rounding them lost.
-    sign: of d_kz. stretch: world length for one unit of z.
+    sign: of d_kz. stretch: world length for one unit of z. near, far: depths between which a ray
+    is seen, None for 0 and for no end. stop: depth behind which nothing can be seen any more, at
+    `far` or farther; None with `far`.
     """
 
     axis_x: Array
@@ -51,6 +64,13 @@ class ShearedRays:
     shear_y_low: Array
     sign: Array
     stretch: Array
+    near: Array | None = None
+    far: Array | None = None
+    stop: Array | None = None
+
+    @property
+    def interval(self) -> Interval:
+        return Interval(self.near, self.far, self.stretch)
 
     @property
     def eye(self) -> Array:
@@ -64,9 +84,10 @@ class ShearedRays:
 X, Y, Z, VALUE = range(4)
 
 
-def shear_rays(origins: Array, directions: Array, scale: Array) -> ShearedRays:
-    """Rays (R, 3) in the scene's units, which are world units times `scale` (a power of two)."""
-    d = directions
+def shear_rays(rays: Rays, scale: Array) -> ShearedRays:
+    """Rays in the scene's units, which are world units times `scale` (a power of two). Those that
+    end do so at `far`: see `stopping`."""
+    d = rays.directions
     # d is scaled by a power of two, exactly, so that squares and residuals cannot underflow.
     largest = jnp.max(jnp.abs(lax.stop_gradient(d)), axis=-1)
     axis_z = jnp.argmax(jnp.abs(lax.stop_gradient(d)), axis=-1).astype(jnp.int32)
@@ -78,7 +99,7 @@ def shear_rays(origins: Array, directions: Array, scale: Array) -> ShearedRays:
     def pick(v: Array, axis: Array) -> Array:
         return jnp.take_along_axis(v, axis[:, None], -1)[:, 0]
 
-    o = origins * scale
+    o = rays.origins * scale
     d_x, d_y, d_z = pick(d, axis_x), pick(d, axis_y), pick(d, axis_z)
     s_x, s_y = d_x / d_z, d_y / d_z
 
@@ -87,6 +108,8 @@ def shear_rays(origins: Array, directions: Array, scale: Array) -> ShearedRays:
         return lax.stop_gradient(((numerator - p) - e) / d_z)
 
     norm = jnp.sqrt(jnp.sum((d / largest[:, None]) ** 2, -1)) * largest
+    stretch = norm / jnp.abs(d_z) / scale
+    near, far = (None if x is None else x / stretch for x in (rays.near, rays.far))
     return ShearedRays(
         axis_x,
         axis_y,
@@ -99,7 +122,10 @@ def shear_rays(origins: Array, directions: Array, scale: Array) -> ShearedRays:
         lost(d_x, s_x),
         lost(d_y, s_y),
         jnp.where(forward, 1.0, -1.0).astype(d.dtype),
-        norm / jnp.abs(d_z) / scale,
+        stretch,
+        near,
+        far,
+        None if far is None else lax.stop_gradient(far),
     )
 
 

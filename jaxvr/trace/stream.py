@@ -34,6 +34,7 @@ from jaxvr.trace.face import Crossing, Face, crossing, is_positive, opposite_edg
 from jaxvr.trace.scene import project
 from jaxvr.trace.select import FaceSource, Selection, Sort, next_selection, start_selection
 from jaxvr.trace.shear import ShearedRays, shear_rays
+from jaxvr.view.rays import Rays
 
 Array = jax.Array
 
@@ -48,10 +49,10 @@ class BeamRays:
     directions: Array
 
 
-def beam_rays(origins: Array, directions: Array, scale: Array) -> BeamRays:
-    """Rays (R, 3) in world units."""
-    held = lax.stop_gradient((origins * scale, directions))
-    return BeamRays(shear_rays(origins, directions, scale), *(x.T for x in held))
+def beam_rays(rays: Rays, scale: Array) -> BeamRays:
+    """Rays in world units."""
+    held = lax.stop_gradient((rays.origins * scale, rays.directions))
+    return BeamRays(shear_rays(rays, scale), *(x.T for x in held))
 
 
 def beam(rays: BeamRays) -> Beam:

@@ -25,8 +25,9 @@ def batch_size(dtype: Any) -> int:
 
 
 def batches(most: int, arrays: Any) -> tuple[Any, int]:
-    """Arrays (R, ...) as batches (n, size, ...), the last filled up with copies; and R."""
-    count = arrays[0].shape[0]
+    """A tree of arrays (R, ...) as one of batches (n, size, ...), the last filled up with copies;
+    and R."""
+    count = jax.tree.leaves(arrays)[0].shape[0]
     size = min(most, max(count, 1))
     number = -(-count // size)
 
@@ -34,7 +35,7 @@ def batches(most: int, arrays: Any) -> tuple[Any, int]:
         x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (number * size - count, *x.shape[1:]))])
         return x.reshape(number, size, *x.shape[1:])
 
-    return tuple(split(x) for x in arrays), count
+    return jax.tree.map(split, arrays), count
 
 
 def tile(x: Array) -> Array:

@@ -12,6 +12,8 @@ from jax import lax
 from jaxvr.adjoint import Pipeline
 from jaxvr.adjoint.base import Operands, begin, busy, iterate
 from jaxvr.trace import RayCast, Recorded, Segments
+from jaxvr.trace.recorded import Runs
+from jaxvr.view.rays import Rays
 
 
 @partial(quick.jit, static_argnums=(0, 1, 2))
@@ -23,9 +25,11 @@ def iterations(integrator, compositor, shorten: bool, volume: Any, rays: Any, tr
     """
     tracer: Any = Recorded() if isinstance(volume, Segments) else RayCast()
     if isinstance(volume, Segments):
-        rays = volume.start[:-1], volume.start[1:]
+        rays = Runs(volume.start[:-1], volume.start[1:])
+    else:
+        rays = Rays(*rays)
     pipeline, scene = Pipeline(tracer, integrator, compositor), tracer.prepare(volume)
-    rays = tracer.prepare_rays(scene, *rays)
+    rays = tracer.prepare_rays(scene, rays)
     table = integrator.prepare(transfer, transfer.positions.dtype, tracer.longest(scene))
     if shorten:
         table = integrator.shorten(table, True)

@@ -77,10 +77,6 @@ def test_what_cannot_be_had_from_behind_is_said():
     sideways: Any = "sideways"
     with pytest.raises(ValueError, match=r"direction must be one of .* but is 'sideways'"):
         Over(direction=sideways)
-    with pytest.raises(ValueError, match="RayCast walks from the eye"):
-        jaxvr.render(mesh, camera, transfer, compositor=BEHIND)
-    with pytest.raises(ValueError, match=r"shade\(trace"):
-        jaxvr.render_rays(mesh, *camera.rays(), transfer, compositor=BEHIND)
     with pytest.raises(ValueError, match=r"native=True.*front to back"):
         adjoint = jaxvr.Replay(native=True)
         jaxvr.shade(jaxvr.trace(mesh, camera), transfer, compositor=BEHIND, adjoint=adjoint)

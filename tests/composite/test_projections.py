@@ -22,6 +22,7 @@ from jaxvr.numerics import compensated
 from jaxvr.optics import Segment
 from jaxvr.testing import BruteForce, assert_gradients
 from jaxvr.trace import RayCast
+from jaxvr.view.rays import Rays, flat
 from jaxvr.volume import datasets
 
 EPS = {"float32": 1.2e-7, "float64": 2.3e-16}
@@ -115,7 +116,7 @@ def test_replay_by_the_other_engine(compositor):
     integrator = compositor.default_integrator()
     pipeline = Pipeline(RayCast(), integrator, compositor)
     scene = pipeline.tracer.prepare(mesh)
-    rays = pipeline.tracer.prepare_rays(scene, *(x.reshape(-1, 3) for x in camera.rays()))
+    rays = pipeline.tracer.prepare_rays(scene, flat(Rays(*camera.rays())))
     rays = jax.tree.map(lambda x: x[None], rays)
     table = integrator.prepare(transfer, jnp.float32, pipeline.tracer.longest(scene))
     operands = Operands(scene, rays, table)

@@ -12,6 +12,7 @@ import pytest
 import jaxvr
 from jaxvr._core import status as bits
 from jaxvr.trace import cover, select
+from jaxvr.view.rays import Rays, flat
 from jaxvr.volume import datasets
 
 pytestmark = pytest.mark.usefixtures("quick_code")
@@ -245,7 +246,7 @@ def test_faces_are_selected_in_bounded_lists(monkeypatch):
 
 def _start(tracer, mesh, camera):
     scene = tracer.prepare(mesh)
-    rays = tracer.prepare_rays(scene, *(x.reshape(-1, 3) for x in camera.rays()))
+    rays = tracer.prepare_rays(scene, flat(Rays(*camera.rays())))
     return tracer.start(scene, rays)
 
 

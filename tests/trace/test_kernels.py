@@ -13,6 +13,7 @@ import pytest
 from jaxvr._core.gather import load, take
 from jaxvr._core.once import once
 from jaxvr.trace import RayCast
+from jaxvr.view.rays import Rays
 from jaxvr.volume import datasets
 
 pytestmark = pytest.mark.optimised
@@ -28,7 +29,7 @@ def test_no_kernel_of_a_step_is_handed_to_several_threads(location):
 
     def walk(mesh, origins, directions):
         scene = tracer.prepare(mesh)
-        rays = tracer.prepare_rays(scene, origins, directions)
+        rays = tracer.prepare_rays(scene, Rays(origins, directions))
 
         def body(carry):
             state, total = carry

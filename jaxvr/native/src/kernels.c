@@ -53,14 +53,16 @@ typedef struct {
   Turns turns;
 } Task;
 
-/* vertices, values, cells, neighbors, low, high, faces, axes, numbers, options: arguments 0 to 9. */
+/* vertices, values, cells, neighbors, low, high, faces, axes, numbers, bounds, options: arguments 0 to
+ * 10. */
 static World world_of(XLA_FFI_CallFrame *frame) {
-  const int32_t *options = argument(frame, 9);
+  const int32_t *options = argument(frame, 10);
   World world = {
       {argument(frame, 0), argument(frame, 1), argument(frame, 2), argument(frame, 3), options[0],
        options[1], extent(frame, 0, 0) / 4, extent(frame, 2, 0) / 4, NULL},
       {argument(frame, 4), argument(frame, 5), argument(frame, 6), extent(frame, 6, 0)},
-      {extent(frame, 7, 1), argument(frame, 7), argument(frame, 8)},
+      {extent(frame, 7, 1), argument(frame, 7), argument(frame, 8),
+       extent(frame, 9, 1) ? argument(frame, 9) : NULL},
   };
   return world;
 }
@@ -169,7 +171,7 @@ static void render_block(void *data, int k) {
   fill_block(world, block, first, count, ROWS);
   begin_pixels(task, &block->lanes, block->n, first, count);
   while (goes_on(world, block)) {
-    arrive(&world->mesh, &block->lanes, block->n);
+    arrive(world, &block->lanes, block->n);
     composite_segments(optics, &block->lanes, block->n);
     leave(&world->mesh, &block->lanes, block->n);
     settle(world, block, ROWS, optics->enough, keep_sums, task);
@@ -221,7 +223,7 @@ static void keep_bars(void *data, Lanes *lanes, int lane) {
   int64_t n = task->count, r = lanes->integer[RAY][lane];
   double *table = worker->share->table;
   if (table) hand_in(&task->optics.transfer, lanes, lane, table);
-  for (int k = 0; task->rays_bar && k < 6; k++)
+  for (int k = 0; task->rays_bar && k < RAY_BARS; k++)
     task->rays_bar[k * n + r] = lanes->row[RBAR + k][lane];
 }
 
@@ -232,14 +234,15 @@ static void pull_block(Worker *worker, int64_t first) {
   const Optics *optics = &task->optics;
   Block *block = worker->block;
   Lanes *lanes = &block->lanes;
-  if (task->rays_bar) clear_rays(task->rays_bar, 6, task->count, first, rays_in(task, first));
+  if (task->rays_bar) clear_rays(task->rays_bar, RAY_BARS, task->count, first, rays_in(task, first));
   fill_block(world, block, first, rays_in(task, first), ALL_ROWS);
   load_pixels(task, lanes, block->n);
   while (goes_on(world, block)) {
     int n = block->n;
-    arrive(&world->mesh, lanes, n);
+    arrive(world, lanes, n);
     pull_segments(optics, lanes, n, share->table);
-    if (share->vertices.sum || task->rays_bar) pull_cells(lanes, n, worker->bar);
+    if (share->vertices.sum || task->rays_bar)
+      pull_cells(lanes, n, worker->bar, world->rays.bounds != NULL);
     if (share->vertices.sum)
       scatter_cells(&world->mesh, lanes, n, worker->bar, &share->vertices, &share->values);
     if (share->vertices.sum || task->rays_bar)
@@ -420,7 +423,7 @@ EXPORT void jaxvr_listen(int yes) { atomic_store(&listens, yes); }
 
 EXPORT Failure jaxvr_render(XLA_FFI_CallFrame *frame) {
   if (asks_metadata(frame)) return NULL;
-  Task task = {.world = world_of(frame), .optics = optics_of(frame, 10),
+  Task task = {.world = world_of(frame), .optics = optics_of(frame, 11),
                .sums = result(frame, 0), .status = result(frame, 1)};
   task.count = task.world.rays.count;
   task.where = size_of(frame, 2) ? result(frame, 2) : NULL;
@@ -437,17 +440,17 @@ EXPORT Failure jaxvr_shade(XLA_FFI_CallFrame *frame) {
   return run_or_fail(frame, blocks_of(task.count), shade_block, &task);
 }
 
-/* Results: table (2 K, NODE_PAIR), vertices (P, 4), values, rays (6, N). */
+/* Results: table (2 K, NODE_PAIR), vertices (P, 4), values, rays (RAY_BARS, N). */
 EXPORT Failure jaxvr_render_pull(XLA_FFI_CallFrame *frame) {
   if (asks_metadata(frame)) return NULL;
-  Task task = {.world = world_of(frame), .optics = optics_of(frame, 10),
-               .finals = argument(frame, 15), .pixel_bar = argument(frame, 16),
+  Task task = {.world = world_of(frame), .optics = optics_of(frame, 11),
+               .finals = argument(frame, 16), .pixel_bar = argument(frame, 17),
                .vertices_bar = result(frame, 1), .values_bar = result(frame, 2),
                .table_size = size_of(frame, 0), .vertices_size = size_of(frame, 1),
                .values_size = size_of(frame, 2)};
   task.count = task.world.rays.count;
   task.rays_bar = size_of(frame, 3) ? result(frame, 3) : NULL;
-  task.goal = extent(frame, 17, 0) ? argument(frame, 17) : NULL;
+  task.goal = extent(frame, 18, 0) ? argument(frame, 18) : NULL;
   memset(task.vertices_bar, 0, task.vertices_size * sizeof(real));
   memset(task.values_bar, 0, task.values_size * sizeof(real));
   return pull(frame, &task);
@@ -491,7 +494,7 @@ static void count_block(void *data, int k) {
   memset(task->status + first, 0, count * sizeof(int32_t));
   fill_block(&task->world, block, first, count, ROWS);
   while (goes_on(&task->world, block)) {
-    arrive(&task->world.mesh, lanes, block->n);
+    arrive(&task->world, lanes, block->n);
     for (int i = 0; i < block->n; i++)
       if (!lanes->integer[LOST][i]) lanes->integer[SLAB][i] += 1 + (lanes->integer[FRESH][i] != 0);
     leave(&task->world.mesh, lanes, block->n);
@@ -509,7 +512,7 @@ static void fill_nodes_block(void *data, int k) {
   fill_block(&task->world, block, first, rays_in(task, first), ROWS);
   for (int i = 0; i < block->n; i++) lanes->integer[SLAB][i] = task->start[lanes->integer[RAY][i]];
   while (goes_on(&task->world, block)) {
-    arrive(&task->world.mesh, lanes, block->n);
+    arrive(&task->world, lanes, block->n);
     for (int i = 0; i < block->n; i++) {
       if (lanes->integer[LOST][i]) continue;
       int64_t at = lanes->integer[SLAB][i], needed = 1 + (lanes->integer[FRESH][i] != 0);
@@ -543,9 +546,9 @@ EXPORT Failure jaxvr_count(XLA_FFI_CallFrame *frame) {
 /* Only of the first rays, as many as have a start: the rest are copies that fill a batch. */
 EXPORT Failure jaxvr_fill(XLA_FFI_CallFrame *frame) {
   if (asks_metadata(frame)) return NULL;
-  Task task = {.world = world_of(frame), .start = argument(frame, 10),
+  Task task = {.world = world_of(frame), .start = argument(frame, 11),
                .scalar = result(frame, 0), .length = result(frame, 1),
-               .total = size_of(frame, 0), .count = extent(frame, 10, 0)};
+               .total = size_of(frame, 0), .count = extent(frame, 11, 0)};
   memset(task.scalar, 0, size_of(frame, 0) * sizeof(real));
   memset(task.length, 0, size_of(frame, 1) * sizeof(real));
   return run_or_fail(frame, blocks_of(task.count), fill_nodes_block, &task);

@@ -9,6 +9,7 @@
 #define LANES 128       /* rays in a block; its rows stay in the cache */
 #define ENTRIES 8       /* entries of a ray found at a time */
 #define SLAB_NUMBERS 16 /* see slab.h */
+#define RAY_BARS 8      /* cotangents of a ray; of one without bounds the last two are 0 */
 #define NODE_PAIR 10    /* position, extinction, r, g, b of a slab's lower and upper control point */
 
 enum { VX, VY, VZ, VLOW, VVALUE, VERTEX }; /* rows of a vertex, see trace/shear.py */
@@ -17,25 +18,28 @@ enum { VX, VY, VZ, VLOW, VVALUE, VERTEX }; /* rows of a vertex, see trace/shear.
  * APEX: the fourth vertex; LEAVE: weights of the exit face's vertices, OF_B and OF_C: barycentric
  * coordinates of the last two. DEPTH: how far the ray has come; LEAD: by how much farther that is
  * than the face it stands in, 0 but behind overturned cells, and CUT: what that was at the segment's
- * entry, see make_segment of trace/local.py. RECORD: the numbers of the slab that SLAB names. SUMS:
+ * entry, see make_segment of trace/local.py; VALUE: the scalar at the face ahead, which BACK is not
+ * where a segment is cut. RECORD: the numbers of the slab that SLAB names. SUMS:
  * compensated optical depth and r, g, b, totals first. For derivatives, FINAL and PIXEL: those sums
  * at the ray's end and the pixel's cotangent; SBAR, RBAR, TBAR: cotangents of the segment's front,
- * back and length, of the ray's origin, S_x, S_y and stretch, and of the slab's control points. */
+ * back and length, of the ray's origin, S_x, S_y, stretch, near and far, and of the slab's control
+ * points. NEAR, FAR, STOP: depths, see Rays of walk.h. */
 enum {
-  ORIGIN, SHEAR_X = ORIGIN + 3, SHEAR_Y = SHEAR_X + 3, SIGN = SHEAR_Y + 3, STRETCH,
+  ORIGIN, SHEAR_X = ORIGIN + 3, SHEAR_Y = SHEAR_X + 3, SIGN = SHEAR_Y + 3, STRETCH, NEAR, FAR, STOP,
   FACE, WEIGHT = FACE + 3 * VERTEX, APEX = WEIGHT + 3, LEAVE = APEX + VERTEX,
-  OF_B = LEAVE + 3, OF_C, DEPTH, LEAD = DEPTH + 2, CUT, FRONT, BACK, LENGTH, CURSOR, RECORD,
+  OF_B = LEAVE + 3, OF_C, DEPTH, LEAD = DEPTH + 2, CUT, VALUE, FRONT, BACK, LENGTH, CURSOR, RECORD,
   SUMS = RECORD + SLAB_NUMBERS, ROWS = SUMS + 8,
-  FINAL = ROWS, PIXEL = FINAL + 8, SBAR = PIXEL + 4, RBAR = SBAR + 3, TBAR = RBAR + 6,
+  FINAL = ROWS, PIXEL = FINAL + 8, SBAR = PIXEL + 4, RBAR = SBAR + 3,
+  TBAR = RBAR + RAY_BARS,
   ALL_ROWS = TBAR + NODE_PAIR
 };
 enum { A = FACE, B = FACE + VERTEX, C = FACE + 2 * VERTEX };
 /* Rows of integers. REACHED, CUT_AT: where LEAD or CUT is not 0, the word of the face where the
- * depth was reached. BEHIND: bit 0 whether the segment starts behind the eye, bit 1 whether it ends
- * there, see make_segment of trace/local.py. FRESH: the segment does not start where the one before
+ * depth was reached. SIDES: where the segment's ends lie, bits 0 and 1 before NEAR, and bits 2 and 3
+ * beyond FAR, see make_segment of trace/local.py. FRESH: the segment does not start where the one before
  * has ended, in scalar. WHERE: of the largest scalar, see whole.h. */
 enum {
-  RAY, AXES, WORD = AXES + 3, POINT, POSITIVE, DROP, REACHED, CUT_AT, BEHIND, SLAB, FRESH, NEXT, END, LOST,
+  RAY, AXES, WORD = AXES + 3, POINT, POSITIVE, DROP, REACHED, CUT_AT, SIDES, SLAB, FRESH, NEXT, END, LOST,
   SLOT, WHERE, INTEGERS
 };
 

@@ -127,8 +127,9 @@ static void entry_shares(Lanes *lanes, int n, real share[2][LANES]) {
   }
 }
 
-/* cuts: whether any segment may be cut off at a depth reached before, by CUT. */
-INLINE void pull_cells_by(Lanes *lanes, int n, CellBar *bar, const int cuts) {
+/* cuts: whether any segment may be cut off at a depth reached before, by CUT. bounded: whether rays
+ * have bounds. */
+INLINE void pull_cells_by(Lanes *lanes, int n, CellBar *bar, const int cuts, const int bounded) {
   real(*row)[LANES] = lanes->row;
   entry_shares(lanes, n, bar->share);
   LANES_LOOP
@@ -161,21 +162,47 @@ INLINE void pull_cells_by(Lanes *lanes, int n, CellBar *bar, const int cuts) {
     real s0 = cuts ? si + (so - si) * share : si;
     real z1 = PICK(proper, zo + zo_low, z0);
     /* As the walk has found: made anew, depths at the eye are rounded in another way. */
-    int behind = lanes->integer[BEHIND][i];
-    word_t behind0 = MASK((behind & 1) != 0), behind1 = MASK((behind & 2) != 0);
-    word_t cut_off = behind0 ^ behind1;
-    real whole = PICK(cut_off & MASK(z0 != z1), z1 - z0, 1), t = -z0 / whole, difference = so - s0;
-    real kept = PICK(behind0 | ~proper, 0, chord);
-    real length = PICK(cut_off, PICK(behind0, z1, z0), kept);
-    real scaled = length_bar * row[STRETCH][i];
-    real along = PICK(behind0 | ~near, 0, PICK(turned, -scaled, scaled));
-    real cut_bar = PICK(behind0, front_bar, back_bar); /* of the scalar at the eye */
-    real t_bar = cut_bar * difference / (whole * whole);
-    real zi_bar = PICK(cut_off, PICK(behind0, 0, scaled) - t_bar * z1, -along);
-    real zo_bar = PICK(cut_off, PICK(behind0, scaled, 0) + t_bar * z0, along);
-    real si_cut = PICK(behind0, front_bar * (1 - t), front_bar + back_bar * (1 - t));
-    real so_cut = PICK(behind0, back_bar + front_bar * t, back_bar * t);
-    real si_bar = PICK(cut_off, si_cut, front_bar), so_bar = PICK(cut_off, so_cut, back_bar);
+    int sides = lanes->integer[SIDES][i];
+    real scaled = length_bar * row[STRETCH][i], difference = so - s0, length;
+    real zi_bar, zo_bar, si_bar, so_bar;
+    if (bounded) {
+      /* Each end that is cut lies at a depth c, where the scalar is s0 + difference t with
+       * t = (c - z0) / (z1 - z0); an end of the length is c, or one of the crossings. */
+      Bounded at = bounded_by(z0, z1, row[NEAR][i], row[FAR][i], sides);
+      word_t cut0 = MASK(at.front), cut1 = MASK(at.back), cut_off = cut0 | cut1;
+      real whole = PICK(cut_off & MASK(z0 != z1), z1 - z0, 1);
+      real t0 = PICK(cut0, at.from - z0, 0) / whole, t1 = PICK(cut1, at.to - z0, 0) / whole;
+      word_t backwards = MASK(at.backwards);
+      length = PICK(cut_off, PICK(backwards, at.from - at.to, at.to - at.from),
+                    PICK(MASK(at.outside) | ~proper, 0, chord));
+      real along = PICK(MASK(at.outside) | ~near, 0, PICK(turned, -scaled, scaled));
+      real onward = PICK(backwards, -scaled, scaled);
+      real from_bar = PICK(cut0, front_bar * difference / whole, 0);
+      real to_bar = PICK(cut1, back_bar * difference / whole, 0);
+      real moved = from_bar * (1 - t0) + to_bar * (1 - t1), led = from_bar * t0 + to_bar * t1;
+      zi_bar = PICK(cut_off, PICK(cut0, 0, -onward) - moved, -along);
+      zo_bar = PICK(cut_off, PICK(cut1, 0, onward) - led, along);
+      si_bar = PICK(cut0, front_bar * (1 - t0), front_bar) + PICK(cut1, back_bar * (1 - t1), 0);
+      so_bar = PICK(cut1, back_bar * t1, back_bar) + PICK(cut0, front_bar * t0, 0);
+      real at_front = PICK(cut0, from_bar - onward, 0), at_back = PICK(cut1, to_bar + onward, 0);
+      word_t near0 = MASK(sides & 1), near1 = MASK((sides >> 1) & 1);
+      row[RBAR + 6][i] += PICK(near0, at_front, 0) + PICK(near1, at_back, 0);
+      row[RBAR + 7][i] += PICK(near0, 0, at_front) + PICK(near1, 0, at_back);
+    } else {
+      word_t behind0 = MASK((sides & 1) != 0), behind1 = MASK((sides & 2) != 0);
+      word_t cut_off = behind0 ^ behind1;
+      real whole = PICK(cut_off & MASK(z0 != z1), z1 - z0, 1), t = -z0 / whole;
+      real kept = PICK(behind0 | ~proper, 0, chord);
+      length = PICK(cut_off, PICK(behind0, z1, z0), kept);
+      real along = PICK(behind0 | ~near, 0, PICK(turned, -scaled, scaled));
+      real cut_bar = PICK(behind0, front_bar, back_bar); /* of the scalar at the eye */
+      real t_bar = cut_bar * difference / (whole * whole);
+      zi_bar = PICK(cut_off, PICK(behind0, 0, scaled) - t_bar * z1, -along);
+      zo_bar = PICK(cut_off, PICK(behind0, scaled, 0) + t_bar * z0, along);
+      real si_cut = PICK(behind0, front_bar * (1 - t), front_bar + back_bar * (1 - t));
+      real so_cut = PICK(behind0, back_bar + front_bar * t, back_bar * t);
+      si_bar = PICK(cut_off, si_cut, front_bar), so_bar = PICK(cut_off, so_cut, back_bar);
+    }
     if (cuts) {
       /* s0 = si + (so - si) share, share = (z0 - zi) / (zo - zi), and z0 is another face's. */
       word_t inside = cut & MASK(place > 0) & MASK(place < 1);
@@ -224,9 +251,11 @@ typedef struct {
   int64_t size; /* of sum */
 } Part;
 
-static void pull_cells(Lanes *lanes, int n, CellBar *bar) {
-  if (lanes->cuts) pull_cells_by(lanes, n, bar, 1);
-  else pull_cells_by(lanes, n, bar, 0);
+static void pull_cells(Lanes *lanes, int n, CellBar *bar, int bounded) {
+  if (bounded && lanes->cuts) pull_cells_by(lanes, n, bar, 1, 1);
+  else if (bounded) pull_cells_by(lanes, n, bar, 0, 1);
+  else if (lanes->cuts) pull_cells_by(lanes, n, bar, 1, 0);
+  else pull_cells_by(lanes, n, bar, 0, 0);
 }
 
 /* Takes the cotangents of depths where segments were cut off to the faces that those are of. */

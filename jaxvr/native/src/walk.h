@@ -10,11 +10,13 @@
 #define STATUS_LOST 1
 #define STATUS_BROKEN 8
 
-/* axes (3, N); numbers (9, N): origin, S_x, S_y, their lost parts, sign, stretch. */
+/* axes (3, N); numbers (9, N): origin, S_x, S_y, their lost parts, sign, stretch. bounds (3, N), or
+ * NULL for rays that are seen from the eye on: near, far, and stop, the depth behind which nothing
+ * can be seen any more. */
 typedef struct {
   int64_t count;
   const int32_t *axes;
-  const real *numbers;
+  const real *numbers, *bounds;
 } Rays;
 
 typedef struct {
@@ -56,6 +58,7 @@ static int enter(const World *world, Block *block, int lane) {
     search(&world->mesh, &world->tree, 1, ray, list, &depth, &face);
     if (!list->count) return 0;
   }
+  if (list->depth[list->next] > lanes->row[STOP][lane]) return 0;
   int32_t word = list->face[list->next++];
   FaceSeen face;
   see_face(&world->mesh, ray, word >> 4, word & 3, &face);
@@ -66,7 +69,7 @@ static int enter(const World *world, Block *block, int lane) {
   lanes->row[DEPTH][lane] = face.z;
   lanes->row[DEPTH + 1][lane] = face.z_low;
   lanes->row[LEAD][lane] = 0;
-  lanes->row[BACK][lane] = face.value;
+  lanes->row[VALUE][lane] = lanes->row[BACK][lane] = face.value;
   lanes->integer[NEXT][lane] = word & ~8;
   lanes->integer[POSITIVE][lane] = face.positive;
   lanes->integer[FRESH][lane] = 1;
@@ -87,8 +90,11 @@ static void fill_block(const World *world, Block *block, int64_t first, int coun
   Lanes *lanes = &block->lanes;
   int n = 0;
   lanes->leads = lanes->cuts = 0;
+  const real *bounds = world->rays.bounds;
   for (int i = 0; i < count; i++) {
     lanes->integer[SLOT][n] = i;
+    for (int k = 0; k < 3; k++)
+      lanes->row[NEAR + k][n] = bounds ? bounds[k * world->rays.count + first + i] : k ? INFINITY : 0;
     if (!enter(world, block, n)) continue;
     const Ray *ray = block->rays + i;
     real numbers[] = {ray->origin[0], ray->origin[1], ray->origin[2], ray->x_high, ray->x_rest,
@@ -120,20 +126,53 @@ static void reload_values(const Mesh *mesh, Lanes *lanes, int n) {
       w[v] = lanes->row[WEIGHT + v][i];
     }
     shares(x, y, w, &of_b, &of_c);
-    lanes->row[BACK][i] = s[0] + (of_b * (s[1] - s[0]) + of_c * (s[2] - s[0]));
+    lanes->row[VALUE][i] = s[0] + (of_b * (s[1] - s[0]) + of_c * (s[2] - s[0]));
     lanes->integer[FRESH][i] = 1;
   }
 }
 
 /* What lies behind the eye is cut off: returns the length in units of depth. */
-INLINE real clip_at_eye(real z0, real z1, real chord, real *front, real *back) {
+INLINE real clip_at_eye(real z0, real z1, real chord, real *front, real *back, int32_t *sides) {
   int behind0 = z0 < 0, behind1 = z1 < 0, cuts = behind0 != behind1;
   real whole = cuts ? z1 - z0 : 1;
   real at_eye = *front + (*back - *front) * (-z0 / whole);
   *front = cuts & behind0 ? at_eye : *front;
   *back = cuts & behind1 ? at_eye : *back;
+  *sides = behind0 | (behind1 << 1);
   real kept = behind0 ? 0 : chord;
   return cuts ? most(z0, z1) : kept;
+}
+
+/* Where a segment from z0 to z1 with ends on these sides is cut: whether at its front and at its
+ * back, the depths there (its own where it is not), and whether it runs backwards if it is cut. */
+typedef struct {
+  int front, back, outside, backwards;
+  real from, to;
+} Bounded;
+
+INLINE Bounded bounded_by(real z0, real z1, real near, real far, int sides) {
+  int before0 = sides & 1, before1 = (sides >> 1) & 1, beyond0 = (sides >> 2) & 1, beyond1 = sides >> 3;
+  int outside = (before0 & before1) | (beyond0 & beyond1);
+  int front = (before0 | beyond0) & !outside, back = (before1 | beyond1) & !outside;
+  real from = before0 ? near : far, to = before1 ? near : far;
+  Bounded out = {front, back, outside, before1 | beyond0, front ? from : z0, back ? to : z1};
+  return out;
+}
+
+/* The same with what lies outside of near and far: `_within` of trace/local.py. */
+INLINE real clip_to(real near, real far, real z0, real z1, real chord, real *front, real *back,
+                    int32_t *sides) {
+  int before0 = z0 < near, before1 = z1 < near, beyond0 = z0 > far, beyond1 = z1 > far;
+  *sides = before0 | (before1 << 1) | (beyond0 << 2) | (beyond1 << 3);
+  Bounded cut = bounded_by(z0, z1, near, far, *sides);
+  real whole = (cut.front | cut.back) & (z0 != z1) ? z1 - z0 : 1, change = *back - *front;
+  real first = *front + change * ((cut.from - z0) / whole);
+  real last = *front + change * ((cut.back ? cut.to - z0 : 0) / whole);
+  *back = cut.back ? last : *back;
+  *front = cut.front ? first : *front;
+  real seen = cut.backwards ? cut.from - cut.to : cut.to - cut.from;
+  real kept = cut.outside ? 0 : chord;
+  return cut.front | cut.back ? seen : kept;
 }
 
 /* Barycentric coordinates of exits by rays that lie in the exit face's plane. */
@@ -153,8 +192,8 @@ static void exits_on_edge(Lanes *lanes, int n) {
 #define ROUNDING (16 * (real)REAL_EPS)
 
 /* From where the lanes have come to up to their exits. leads: whether any LEAD is not 0; returns
- * whether any is now. */
-INLINE word_t segments(Lanes *lanes, int n, const int leads) {
+ * whether any is now. bounded: whether rays have bounds. */
+INLINE word_t segments_by(Lanes *lanes, int n, const int leads, const int bounded) {
   real(*row)[LANES] = lanes->row;
   int32_t(*integer)[LANES] = lanes->integer;
   word_t any = 0;
@@ -174,7 +213,7 @@ INLINE word_t segments(Lanes *lanes, int n, const int leads) {
     real advance = (z - d0) + (z_low - d1), chord = turned ? -advance : advance;
     int proper = chord > 0;
     real e0 = proper ? z : d0, e1 = proper ? z_low : d1;
-    real entry = row[BACK][i], front = entry, back = value;
+    real front = row[VALUE][i], back = value, last = row[BACK][i];
     if (leads) {
       real lead = row[LEAD][i], whole = lead + advance;
       int cut = proper & (lead != 0), same = integer[REACHED][i];
@@ -187,22 +226,31 @@ INLINE word_t segments(Lanes *lanes, int n, const int leads) {
     word_t late = MASK(chord <= -ROUNDING);
     real left = PICK(late, -advance, 0);
     any |= late;
-    real length = clip_at_eye(d0 + d1, e0 + e1, proper ? chord : 0, &front, &back);
-    integer[BEHIND][i] = (d0 + d1 < 0) | ((e0 + e1 < 0) << 1);
+    real z0 = d0 + d1, z1 = e0 + e1, kept = proper ? chord : 0, length;
+    if (bounded)
+      length = clip_to(row[NEAR][i], row[FAR][i], z0, z1, kept, &front, &back, &integer[SIDES][i]);
+    else length = clip_at_eye(z0, z1, kept, &front, &back, &integer[SIDES][i]);
     row[DEPTH][i] = e0;
     row[DEPTH + 1][i] = e1;
     row[LEAD][i] = left;
     row[FRONT][i] = front;
     row[BACK][i] = back;
     row[LENGTH][i] = integer[LOST][i] ? 0 : length * row[STRETCH][i];
-    integer[FRESH][i] |= front != entry;
+    row[VALUE][i] = value;
+    integer[FRESH][i] |= front != last;
   }
   for (int i = 0; any && !leads && i < n; i++) integer[REACHED][i] = integer[WORD][i];
   return any;
 }
 
+static word_t segments(Lanes *lanes, int n, int bounded) {
+  if (bounded) return lanes->leads ? segments_by(lanes, n, 1, 1) : segments_by(lanes, n, 0, 1);
+  return lanes->leads ? segments_by(lanes, n, 1, 0) : segments_by(lanes, n, 0, 0);
+}
+
 /* The fourth vertex of each lane's new cell, the exit, and the segment. */
-static void arrive(const Mesh *mesh, Lanes *lanes, int n) {
+static void arrive(const World *world, Lanes *lanes, int n) {
+  const Mesh *mesh = &world->mesh;
   real(*row)[LANES] = lanes->row;
   int32_t(*integer)[LANES] = lanes->integer;
   const real *restrict vertices = mesh->vertices;
@@ -264,7 +312,7 @@ static void arrive(const Mesh *mesh, Lanes *lanes, int n) {
     on_edge |= MASK(sum == 0);
   }
   if (on_edge) exits_on_edge(lanes, n);
-  word_t behind = lanes->leads ? segments(lanes, n, 1) : segments(lanes, n, 0);
+  word_t behind = segments(lanes, n, world->rays.bounds != NULL);
   lanes->cuts = lanes->leads;
   lanes->leads = behind != 0;
 }
@@ -304,8 +352,14 @@ static inline int goes_on(const World *world, Block *block) {
   return block->n && !is_over(watch);
 }
 
-/* Lanes that left the mesh enter again, or are handed to `done` and make room; so do those whose
- * optical depth has reached `enough`. */
+/* Whether a lane needs nothing more: its optical depth has reached `enough`, or it is through. */
+static inline word_t is_done(const Lanes *lanes, int i, real enough) {
+  word_t opaque = MASK(lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough);
+  return opaque | MASK(lanes->row[DEPTH][i] + lanes->row[DEPTH + 1][i] > lanes->row[STOP][i]);
+}
+
+/* Lanes that left the mesh enter again, or are handed to `done` and make room; so do those that are
+ * done. */
 static void settle(const World *world, Block *block, int rows, real enough,
                    void (*done)(void *, Lanes *, int), void *data) {
   Lanes *lanes = &block->lanes;
@@ -315,10 +369,10 @@ static void settle(const World *world, Block *block, int rows, real enough,
   for (int i = 0; i < block->n; i++) {
     /* A cell that is not there, and the outside: both are no cell. */
     word_t out = MASK((uint32_t)(lanes->integer[NEXT][i] >> 4) >= cells);
-    any |= out | MASK(lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough);
+    any |= out | is_done(lanes, i, enough);
   }
   for (int i = block->n - 1; any && i >= 0; i--) {
-    int ended = lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough;
+    int ended = is_done(lanes, i, enough) != 0;
     int next = lanes->integer[NEXT][i] >> 4;
     if ((uint32_t)next < cells && !ended) continue;
     if (next != -1 && (uint32_t)next >= cells) is_broken(world->mesh.watch);
