@@ -1,6 +1,6 @@
 """`probe`: the data behind a pixel. What lies along a ray, segment by segment, as arrays.
 
-A picture shows one colour a pixel. `probe` walks the same rays with the same loops as `render` and
+A picture shows one colour a pixel. `probe` walks the same rays as `render`, with JAX's loops, and
 keeps what passes by: which cell, from which distance to which, the scalars there, and what the
 segment adds to the colour at the eye. The contributions of a ray add up to its pixel.
 """

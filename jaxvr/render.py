@@ -22,19 +22,20 @@ import numpy as np
 from jax import lax
 
 from jaxvr import hints
-from jaxvr import native as compiled
 from jaxvr._core.checks import is_concrete
 from jaxvr._core.offsets import bare
 from jaxvr._core.status import BROKEN, LOST, check
+from jaxvr._core.warn import warn
 from jaxvr.adjoint import AbstractAdjoint, Pipeline
 from jaxvr.adjoint.base import Operands, refusing
-from jaxvr.adjoint.replay import settle
+from jaxvr.adjoint.replay import deprecated
 from jaxvr.arguments import (
     adjoint_of,
     background_of,
     camera_of,
     compositor_of,
     dtype_of,
+    engine_of,
     integrator_of,
     offset_of,
     rays_of,
@@ -44,11 +45,12 @@ from jaxvr.arguments import (
     volume_of,
 )
 from jaxvr.composite import AbstractCompositor, Scale
+from jaxvr.engine import XLA, AbstractEngine, C
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.trace import AbstractTracer, Recorded, Segments
 from jaxvr.trace.beam import are_rays
 from jaxvr.trace.integrity import unfit
-from jaxvr.trace.recorded import Nodes, fill, record
+from jaxvr.trace.recorded import Nodes
 from jaxvr.units import mesh_in, transfer_in, units_of
 from jaxvr.view.camera import Camera
 from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
@@ -77,6 +79,7 @@ def render(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: Literal[False] = False,
@@ -93,6 +96,7 @@ def render(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: Literal[True],
@@ -109,6 +113,7 @@ def render(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: bool = False,
@@ -124,6 +129,7 @@ def render(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: bool = False,
@@ -138,10 +144,12 @@ def render(
       tracer: `RayCast()` if None. compositor: `Over()`, or `MaximumIntensity()`, `XRay()`.
         integrator: what the compositor has by default, `Analytic()` for light.
       adjoint: `Replay()`, for reverse mode; `Forward()` for forward mode, `Direct(...)` for both.
+      engine: what runs the loops, `jaxvr.engine.C()` or `jaxvr.engine.XLA()`; None takes C where it
+        does not refuse, asked at every call, or while tracing under your own `jit`.
       background: opaque linear RGB (3,) behind the volume; None leaves it transparent.
       budget: bytes for the state of the rays that march at once, beside the volume and the image;
         None takes what measured fastest, 0.5 MB on CPUs and 220 MB on accelerators in float32.
-        Compiled loops (see `jaxvr.native`) need 0.2 MB a core whatever it is.
+        Loops in C need 0.2 MB a core whatever it is.
       status: also return the status bits (height, width) int32 of the pixels, instead of raising
         what they say: see `jaxvr.check`.
 
@@ -149,10 +157,10 @@ def render(
       image (height, width, 4): premultiplied linear RGBA in the volume's dtype, row 0 on top.
 
     Raises:
-      ValueError: for NaN or infinite operands, a budget below one byte, or a compositor that goes
-        back to front with a tracer that cannot. RenderError: if a ray could not be followed, and
-        for scalars and lengths out of the range that `jaxvr.units` states. Of values only where
-        they are concrete, not inside your own `jit`.
+      ValueError: for NaN or infinite operands, a budget below one byte, a compositor that goes
+        back to front with a tracer that cannot, or an engine that refuses. RenderError: if a ray
+        could not be followed, and for scalars and lengths out of the range that `jaxvr.units`
+        states. Of values only where they are concrete, not inside your own `jit`.
 
     Warns, also only there, with a `jaxvr.ViewWarning` that says what a blank picture comes from, or
     that the field's range and the transfer function's do not fit, that the numbers may be opacities
@@ -165,7 +173,7 @@ def render(
     pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
     camera = camera_of(camera, volume_of(volume))
     transfer = transfer_of(transfer, volume, pipeline.compositor)
-    how = _how(pipeline, adjoint, budget, volume)
+    how = _how(pipeline, adjoint, engine, budget, volume)
     with refusing(how[1]):
         scene = bare(volume), bare(camera), bare(transfer)
         last = offset_of(volume), background_of(background)
@@ -190,6 +198,7 @@ def render_rays(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: Literal[False] = False,
@@ -207,6 +216,7 @@ def render_rays(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: Literal[True],
@@ -224,6 +234,7 @@ def render_rays(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: bool = False,
@@ -240,6 +251,7 @@ def render_rays(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: bool = False,
@@ -261,7 +273,7 @@ def render_rays(
     pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
     origins, directions = rays_of(origins, directions, volume_of(volume))
     transfer = transfer_of(transfer, volume, pipeline.compositor)
-    how = _how(pipeline, adjoint, budget, volume)
+    how = _how(pipeline, adjoint, engine, budget, volume)
     with refusing(how[1]):
         scene = bare(volume), origins, directions, bare(transfer)
         last = offset_of(volume), background_of(background)
@@ -279,6 +291,7 @@ def trace(
     camera: Camera | tuple[Any, Any],
     *,
     tracer: AbstractTracer | None = None,
+    engine: AbstractEngine | None = None,
     budget: int | None = None,
     native: bool | None = None,
 ) -> Segments:
@@ -286,8 +299,8 @@ def trace(
 
     Args:
       camera: a camera, or rays (origins, directions) with shapes (..., 3).
-      budget: as for `render`.
-      native: whether to use compiled loops (see `jaxvr.native`); None for where they can be used.
+      engine, budget: as for `render`.
+      native: deprecated: `engine=jaxvr.engine.C()` for True, `engine=jaxvr.engine.XLA()` for False.
 
     Returns:
       Segments, 8 bytes each in float32 (see `Segments`). They are constants: for gradients with
@@ -309,7 +322,13 @@ def trace(
         origins, directions = rays_of(*camera, volume)
         shape, order = origins.shape[:-1], np.arange(origins.size // 3)
         origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
-    how = (tracer, compiled.covers(native, volume.dtype, tracer), _batch_size(budget, volume))
+    if native is not None:
+        warn(deprecated(f"trace(native={native})", native), DeprecationWarning)
+        if engine is not None:
+            raise ValueError("Pass engine=, or native=, which is deprecated, but not both.")
+        engine = C() if native else XLA()
+    engine = engine_of(engine, None, Pipeline(tracer, None, None), volume.dtype)
+    how = (tracer, engine, _batch_size(budget, volume))
     offset, volume = volume.offset, bare(volume)
     counts, status = _count(*how, volume, origins, directions)
     check(status)
@@ -343,6 +362,7 @@ def shade(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
 ) -> Array:
@@ -359,7 +379,7 @@ def shade(
     segments = segments_of(segments)
     pipeline = _pipeline(Recorded(), integrator, compositor)
     transfer = transfer_of(transfer, segments, pipeline.compositor)
-    how = _how(pipeline, adjoint, budget, segments)
+    how = _how(pipeline, adjoint, engine, budget, segments)
     with refusing(how[1]):
         last = offset_of(segments), background_of(background)
         image, bits = _shade(*how, bare(segments), bare(transfer), *last)
@@ -368,10 +388,13 @@ def shade(
     return unfit(segments, image)
 
 
-def _how(pipeline: Pipeline, adjoint: Any, budget: Any, volume: Any) -> tuple[Any, Any, int]:
-    """What a compiled function depends on beside shapes: nouns, which loops serve, rays at once."""
-    adjoint = settle(adjoint_of(adjoint), pipeline, dtype_of(volume))
-    return pipeline, adjoint, _batch_size(budget, volume)
+def _how(
+    pipeline: Pipeline, adjoint: Any, engine: Any, budget: Any, volume: Any
+) -> tuple[Any, Any, Any, int]:
+    """What a compiled function depends on beside shapes: nouns, the engine, rays at once."""
+    adjoint = adjoint_of(adjoint)
+    engine = engine_of(engine, adjoint, pipeline, dtype_of(volume))
+    return pipeline, adjoint, engine, _batch_size(budget, volume)
 
 
 def _pipeline(
@@ -387,31 +410,32 @@ def _pipeline(
     return Pipeline(tracer, integrator, compositor)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _render(pipeline, adjoint, size, volume, camera, transfer, offset, background):
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def _render(pipeline, adjoint, engine, size, volume, camera, transfer, offset, background):
     # Under a user's own jit operands may be constants: XLA must not compute with them itself.
     volume, camera = lax.optimization_barrier((volume, camera))
     height, width = camera.height, camera.width
     origins, directions = (tile(x) for x in camera.local_rays())
-    rgba, status = _run(pipeline, adjoint, size, volume, origins, directions, transfer, offset)
+    how = pipeline, adjoint, engine, size
+    rgba, status = _run(*how, volume, origins, directions, transfer, offset)
     seen = lax.stop_gradient(rgba[:, 3]).max()  # for `hints`; a background hides it
     rgba = _over(untile(rgba, height, width), background)
     return rgba, untile(status[:, None], height, width)[..., 0], seen
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
 def _render_rays(
-    pipeline, adjoint, size, volume, origins, directions, transfer, offset, background
+    pipeline, adjoint, engine, size, volume, origins, directions, transfer, offset, background
 ):
     shape = origins.shape[:-1]
     volume, origins, directions = lax.optimization_barrier((volume, origins, directions))
     rays = (origins.reshape(-1, 3), directions.reshape(-1, 3))
-    rgba, status = _run(pipeline, adjoint, size, volume, *rays, transfer, offset)
+    rgba, status = _run(pipeline, adjoint, engine, size, volume, *rays, transfer, offset)
     return _over(rgba, background).reshape(*shape, 4), status.reshape(shape)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _shade(pipeline, adjoint, size, segments, transfer, offset, background):
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def _shade(pipeline, adjoint, engine, size, segments, transfer, offset, background):
     segments = lax.optimization_barrier(segments)  # as above
     units = units_of(segments.length, segments.scalar, transfer.positions, parts=_PARTS)
     segments = dataclasses.replace(
@@ -427,38 +451,34 @@ def _shade(pipeline, adjoint, size, segments, transfer, offset, background):
     rays = (rays[0], jnp.where(number < count, rays[1], rays[0]))
     rays = pipeline.tracer.prepare_rays(scene, *rays)
     scale = Scale(units.scalar, units.length, offset)
-    rgba = _finish(pipeline, adjoint, scene, rays, transfer, scale, count)[0]
+    rgba = _finish(pipeline, adjoint, engine, scene, rays, transfer, scale, count)[0]
     rgba = jnp.zeros_like(rgba).at[segments.order].set(rgba, unique_indices=True)
     return _over(rgba, background).reshape(*segments.shape, 4), units.status
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _count(tracer, native, size, volume, origins, directions):
+def _count(tracer, engine, size, volume, origins, directions):
     units = units_of(volume.points, volume.values)
     volume, origins = mesh_in(units, volume), origins * units.length
     scene = tracer.prepare(volume)
     rays, count = batches(size, (origins, directions))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(*rays)
-    found = compiled.kernels.count_nodes(scene, rays) if native else record(tracer, scene, rays)
-    number, status = (x.reshape(-1)[:count] for x in found)
+    number, status = (x.reshape(-1)[:count] for x in engine.count(tracer, scene, rays))
     return number, status | units.status
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 7))
-def _fill(tracer, native, size, volume, origins, directions, start, total):
+def _fill(tracer, engine, size, volume, origins, directions, start, total):
     units = units_of(volume.points, volume.values)
     volume, origins = mesh_in(units, volume), origins * units.length
     scene = tracer.prepare(volume)
-    (origins, directions, starts), _ = batches(size, (origins, directions, start))
-    rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
-    if native:
-        nodes = compiled.kernels.fill_nodes(scene, rays, start, total)
-    else:
-        nodes = fill(tracer, scene, rays, starts, total)
+    rays, _ = batches(size, (origins, directions))
+    rays = jax.vmap(partial(tracer.prepare_rays, scene))(*rays)
+    nodes = engine.fill(tracer, scene, rays, start, total)
     return Nodes(nodes.scalar / units.scalar, nodes.length / units.length)
 
 
-def _run(pipeline, adjoint, size, volume, origins, directions, transfer, offset):
+def _run(pipeline, adjoint, engine, size, volume, origins, directions, transfer, offset):
     """rgba (R, 4) and status (R,) of rays (R, 3)."""
     units = units_of(volume.points, volume.values, transfer.positions)
     volume, origins = mesh_in(units, volume), origins * units.length
@@ -467,28 +487,28 @@ def _run(pipeline, adjoint, size, volume, origins, directions, transfer, offset)
     rays, count = batches(size, (origins, directions))
     rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(*rays)
     scale = Scale(units.scalar, units.length, offset)
-    rgba, status = _finish(pipeline, adjoint, scene, rays, transfer, scale, count)
+    rgba, status = _finish(pipeline, adjoint, engine, scene, rays, transfer, scale, count)
     status = jnp.where(are_rays(origins.T, directions.T), status, status | LOST)
-    good = _in_range(volume, getattr(adjoint, "native", False))
+    good = _in_range(volume, engine.confirms_cells)
     return rgba, jnp.where(good, status, BROKEN) | units.status
 
 
-def _in_range(volume: Any, compiled_loops: Any) -> Array:
-    """Whether integers () of a mesh name points and cells that it has. Compiled loops look at those
-    of cells themselves, as they load them."""
+def _in_range(volume: Any, confirmed: bool) -> Array:
+    """Whether integers () of a mesh name points and cells that it has; confirmed: an engine looks
+    at those of cells itself."""
     count = volume.cells.shape[0]
     good = jnp.all((volume.boundary >= 0) & (volume.boundary >> 4 < count))
-    if compiled_loops:
+    if confirmed:
         return good
     cells, words = volume.cells, volume.neighbors
     good = good & jnp.all((cells >= 0) & (cells < volume.points.shape[0]))
     return good & jnp.all((words >= -1) & (words >> 4 < count))
 
 
-def _finish(pipeline, adjoint, scene, rays, transfer, scale, count):
+def _finish(pipeline, adjoint, engine, scene, rays, transfer, scale, count):
     longest = lax.stop_gradient(pipeline.tracer.longest(scene))
     table = pipeline.integrator.prepare(transfer, longest.dtype, longest)
-    state, status = adjoint.run(pipeline, Operands(scene, rays, table))
+    state, status = adjoint.run(pipeline, Operands(scene, rays, table), engine)
     compositor = pipeline.compositor
     shown = transfer if "transfer" in compositor.needs else None
     rgba = jax.vmap(lambda state: compositor.finish(state, shown, scale))(state)

@@ -47,9 +47,9 @@ rounded_jit = functools.partial(
 # Functions of modules and their static arguments. (`jaxvr.render` and `jaxvr.probe` are functions.)
 STATIC = {
     "jaxvr.render": {
-        "_render": (0, 1, 2),
-        "_render_rays": (0, 1, 2),
-        "_shade": (0, 1, 2),
+        "_render": (0, 1, 2, 3),
+        "_render_rays": (0, 1, 2, 3),
+        "_shade": (0, 1, 2, 3),
         "_count": (0, 1, 2),
         "_fill": (0, 1, 2, 7),
     },

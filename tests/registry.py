@@ -26,7 +26,7 @@ class Entry:
     derivatives. variant: the same class as another entry, or almost; crossed with all adjoints in
     `shade` only. only: names of the integrators that an adjoint can do, or None for all. follows: a
     tracer of the same segments, which is crossed with everything; here all adjoints will do, and
-    other data with one of them.
+    other data with one of them. engine: what runs an adjoint.
     """
 
     name: str
@@ -38,6 +38,7 @@ class Entry:
     reverse: bool = True
     only: tuple[str, ...] | None = None
     follows: str | None = None
+    engine: Any = None
 
     def can(self, integrator: Entry) -> bool:
         return self.only is None or integrator.name in self.only
@@ -71,11 +72,12 @@ INTEGRATORS = [
 ]
 
 ADJOINTS = [
-    Entry("Replay", lambda: jaxvr.Replay(native=False), forward=False),
+    Entry("Replay", jaxvr.Replay, forward=False, engine=jaxvr.engine.XLA()),
     Entry(
         "compiled",
-        lambda: jaxvr.Replay(native=True),
+        jaxvr.Replay,
         forward=False,
+        engine=jaxvr.engine.C(),
         only=("Analytic", "fast", "draft"),
     ),
     Entry("Direct", lambda: jaxvr.Direct(max_steps=64)),
@@ -100,6 +102,11 @@ def _box(location: str, dtype: str):
     if location == "corner":
         return mesh.replace(values=rng.uniform(0, 1, (mesh.n_tets, 4)), location="corner")
     return mesh
+
+
+def engine_of(compiled: bool | None) -> Any:
+    """C, XLA, or what is taken by default."""
+    return None if compiled is None else jaxvr.engine.C() if compiled else jaxvr.engine.XLA()
 
 
 MESHES = ["point", "cell", "corner"]

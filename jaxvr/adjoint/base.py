@@ -28,11 +28,12 @@ Array = jax.Array
 
 @dataclasses.dataclass(frozen=True)
 class Pipeline:
-    """What renders: nouns without arrays, so that it is a static argument."""
+    """What renders: nouns without arrays, so that it is a static argument. integrator, compositor:
+    None where segments are only recorded."""
 
     tracer: AbstractTracer
-    integrator: AbstractIntegrator
-    compositor: AbstractCompositor
+    integrator: AbstractIntegrator | Any
+    compositor: AbstractCompositor | Any
 
 
 class Operands(NamedTuple):
@@ -52,17 +53,34 @@ class March(NamedTuple):
 
 
 class AbstractAdjoint(abc.ABC):
-    """Supplies the loop along the rays, and thereby how it is differentiated.
+    """Says how what an engine runs is differentiated.
 
     no_forward_mode: one with a `custom_vjp` says here what gives forward mode instead.
     """
 
     no_forward_mode: ClassVar[str | None] = None
 
+    def refuses(self, engine: Any) -> str | None:
+        """None where it can work with an engine, else why not: a sentence for users."""
+        return None
+
     @abc.abstractmethod
-    def run(self, pipeline: Pipeline, operands: Operands) -> tuple[Any, Array]:
+    def run(self, pipeline: Pipeline, operands: Operands, engine: Any) -> tuple[Any, Array]:
         """The compositor's state at the end of each ray, leaves (batches, ..., R), and status
-        (batches, R). What `finish` makes of the state is differentiated by JAX."""
+        (batches, R). What `finish` makes of the state is differentiated by JAX.
+
+        engine: an `AbstractEngine`, which runs the loops.
+        """
+
+
+def traced_only(adjoint: Any, engine: Any) -> str | None:
+    """`AbstractAdjoint.refuses` of one that leaves all derivatives to JAX."""
+    if engine.traceable:
+        return None
+    return (
+        f"{type(adjoint).__name__} has JAX differentiate the loop along the rays, and this "
+        "engine's is not written in JAX: take engine=jaxvr.engine.XLA(), or adjoint=jaxvr.Replay()."
+    )
 
 
 def refusing(adjoint: Any) -> contextlib.AbstractContextManager[None]:
