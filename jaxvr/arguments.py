@@ -19,6 +19,7 @@ from jaxvr._core.checks import (
     require_kind,
 )
 from jaxvr._core.offsets import FAR, Origin, is_single, relative, said
+from jaxvr._core.pytree import registered, with_leaves_of
 from jaxvr._core.warn import warn
 from jaxvr.adjoint import AbstractAdjoint, Pipeline, Replay
 from jaxvr.composite import AbstractCompositor, Over
@@ -33,6 +34,8 @@ from jaxvr.volume.integrity import require_mesh
 from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
+
+NOUNS = ("tracer", "integrator", "compositor")
 
 
 def background_of(background: Any) -> Array | None:
@@ -196,6 +199,12 @@ def engine_of(
     return engine
 
 
+def at_the_door(pipeline: Pipeline, dtype: Any) -> Pipeline:
+    """With numbers of nouns as arrays of the volume's dtype."""
+    nouns = {name: with_leaves_of(name, getattr(pipeline, name), dtype) for name in NOUNS}
+    return Pipeline(**nouns)
+
+
 def _noun(name: str, given: Any, method: str, usual: type, default: Any = None) -> Any:
     """What was given, or the default if that is None. It is known by a method: a user's own needs
     no base."""
@@ -205,6 +214,8 @@ def _noun(name: str, given: Any, method: str, usual: type, default: Any = None) 
         raise ValueError(
             f"{name} is the class {given.__name__}, not one of its objects: did you forget the ()?"
         )
+    if hasattr(given, method) and name in NOUNS:
+        return registered(name, given)
     if not hasattr(given, method):
         what = repr(given) if isinstance(given, str) else f"a {type(given).__name__}"
         raise ValueError(f"{name} must be an object such as {_shown(usual)}(), but is {what}.")

@@ -21,6 +21,7 @@ from jaxvr._core.offsets import absolute, bare
 from jaxvr._core.status import check
 from jaxvr.adjoint.base import Operands, Pipeline, advance, begin, busy, shade_piece
 from jaxvr.arguments import (
+    at_the_door,
     camera_of,
     integrator_of,
     rays_of,
@@ -132,6 +133,7 @@ def probe(
     directions = np.ldexp(directions, -np.frexp(largest)[1])
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     pipeline = Pipeline(tracer_of(tracer), integrator_of(integrator, Over()), Over())
+    pipeline = at_the_door(pipeline, volume.dtype)
     size = min(batch_size(volume.dtype), 1 << max(len(origins) - 1, 0).bit_length())
     parts, counts, status = [], [], []
     scene, table, units = _prepare(pipeline, bare(volume), bare(transfer))
@@ -181,7 +183,7 @@ def _pixels_of(pixels: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndar
     return row, column
 
 
-@partial(jax.jit, static_argnums=0)
+@jax.jit
 def _prepare(pipeline: Pipeline, volume: Any, transfer: Any) -> tuple[Any, Any, Units]:
     units = units_of(volume.points, volume.values, transfer.positions)
     volume, transfer = mesh_in(units, volume), transfer_in(units, transfer)
@@ -190,7 +192,7 @@ def _prepare(pipeline: Pipeline, volume: Any, transfer: Any) -> tuple[Any, Any, 
     return scene, pipeline.integrator.prepare(transfer, volume.dtype, longest), units
 
 
-@partial(jax.jit, static_argnums=0)
+@jax.jit
 def _count(tracer: AbstractTracer, scene: Any, origins: Array, directions: Array) -> Any:
     """Nodes, as many as segments or more, and status of R rays."""
     rays = tracer.prepare_rays(scene, origins, directions)
@@ -198,7 +200,7 @@ def _count(tracer: AbstractTracer, scene: Any, origins: Array, directions: Array
     return tuple(x[0] for x in found)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=1)
 def _walk(pipeline: Pipeline, most: int, scene: Any, table: Any, origins: Any, directions: Any):
     """Number of segments (R,), then of each, (R, most, ...): cell, distance of the back, length,
     scalars and contribution."""

@@ -4,9 +4,9 @@
 
 `render` is `shade(trace(...))` without storing the segments. Rays go in batches, square tiles
 of the image, so that the rays of a batch stay together. Integers and floats of volume,
-camera and transfer function are arguments of one compiled function: a new camera, transfer
-function or field does not compile again, a new mesh size, image size or number of control points
-does.
+camera, transfer function and nouns are arguments of one compiled function: a new camera, transfer
+function, field or number of a noun does not compile again, a new mesh size, image size or number of
+control points does.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from jax import lax
 from jaxvr import hints
 from jaxvr._core.checks import is_concrete
 from jaxvr._core.offsets import bare
+from jaxvr._core.pytree import refusing_derivatives, with_leaves_of
 from jaxvr._core.status import BROKEN, LOST, check
 from jaxvr._core.warn import warn
 from jaxvr.adjoint import AbstractAdjoint, Pipeline
@@ -31,6 +32,7 @@ from jaxvr.adjoint.base import Operands, refusing
 from jaxvr.adjoint.replay import deprecated
 from jaxvr.arguments import (
     adjoint_of,
+    at_the_door,
     background_of,
     camera_of,
     compositor_of,
@@ -328,7 +330,7 @@ def trace(
             raise ValueError("Pass engine=, or native=, which is deprecated, but not both.")
         engine = C() if native else XLA()
     engine = engine_of(engine, None, Pipeline(tracer, None, None), volume.dtype)
-    how = (tracer, engine, _batch_size(budget, volume))
+    how = (with_leaves_of("tracer", tracer, volume.dtype), engine, _batch_size(budget, volume))
     offset, volume = volume.offset, bare(volume)
     counts, status = _count(*how, volume, origins, directions)
     check(status)
@@ -392,8 +394,9 @@ def _how(
     pipeline: Pipeline, adjoint: Any, engine: Any, budget: Any, volume: Any
 ) -> tuple[Any, Any, Any, int]:
     """What a compiled function depends on beside shapes: nouns, the engine, rays at once."""
-    adjoint = adjoint_of(adjoint)
-    engine = engine_of(engine, adjoint, pipeline, dtype_of(volume))
+    adjoint, dtype = adjoint_of(adjoint), dtype_of(volume)
+    engine = engine_of(engine, adjoint, pipeline, dtype)
+    pipeline = at_the_door(pipeline, dtype)
     return pipeline, adjoint, engine, _batch_size(budget, volume)
 
 
@@ -410,7 +413,7 @@ def _pipeline(
     return Pipeline(tracer, integrator, compositor)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@partial(jax.jit, static_argnums=(1, 2, 3))
 def _render(pipeline, adjoint, engine, size, volume, camera, transfer, offset, background):
     # Under a user's own jit operands may be constants: XLA must not compute with them itself.
     volume, camera = lax.optimization_barrier((volume, camera))
@@ -423,7 +426,7 @@ def _render(pipeline, adjoint, engine, size, volume, camera, transfer, offset, b
     return rgba, untile(status[:, None], height, width)[..., 0], seen
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@partial(jax.jit, static_argnums=(1, 2, 3))
 def _render_rays(
     pipeline, adjoint, engine, size, volume, origins, directions, transfer, offset, background
 ):
@@ -434,7 +437,7 @@ def _render_rays(
     return _over(rgba, background).reshape(*shape, 4), status.reshape(shape)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@partial(jax.jit, static_argnums=(1, 2, 3))
 def _shade(pipeline, adjoint, engine, size, segments, transfer, offset, background):
     segments = lax.optimization_barrier(segments)  # as above
     units = units_of(segments.length, segments.scalar, transfer.positions, parts=_PARTS)
@@ -456,7 +459,7 @@ def _shade(pipeline, adjoint, engine, size, segments, transfer, offset, backgrou
     return _over(rgba, background).reshape(*segments.shape, 4), units.status
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnums=(1, 2))
 def _count(tracer, engine, size, volume, origins, directions):
     units = units_of(volume.points, volume.values)
     volume, origins = mesh_in(units, volume), origins * units.length
@@ -467,7 +470,7 @@ def _count(tracer, engine, size, volume, origins, directions):
     return number, status | units.status
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 7))
+@partial(jax.jit, static_argnums=(1, 2, 7))
 def _fill(tracer, engine, size, volume, origins, directions, start, total):
     units = units_of(volume.points, volume.values)
     volume, origins = mesh_in(units, volume), origins * units.length
@@ -506,6 +509,8 @@ def _in_range(volume: Any, confirmed: bool) -> Array:
 
 
 def _finish(pipeline, adjoint, engine, scene, rays, transfer, scale, count):
+    nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
+    pipeline = Pipeline(*map(refusing_derivatives, nouns))
     longest = lax.stop_gradient(pipeline.tracer.longest(scene))
     table = pipeline.integrator.prepare(transfer, longest.dtype, longest)
     state, status = adjoint.run(pipeline, Operands(scene, rays, table), engine)

@@ -81,9 +81,9 @@ def arguments_of_replay(native: bool) -> tuple[tuple[Any, ...], Any]:
     """What `render` hands to `_replay`: its static arguments, and the operands."""
     handed: list[Any] = []
 
-    def catch(engine, pipeline, operands):
-        handed.append((engine, pipeline, jax.tree.map(jax.typeof, operands)))
-        return rule(engine, pipeline, operands)
+    def catch(engine, structure, leaves):
+        handed.append((engine, structure, jax.tree.map(jax.typeof, leaves)))
+        return rule(engine, structure, leaves)
 
     rule = replay._replay
     mesh = registry.mesh_of("point", "float64")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import abc
 import contextlib
-import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -18,6 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core.modes import custom_vjp_refused
+from jaxvr._core.pytree import noun
 from jaxvr.composite.base import AbstractCompositor, Piece
 from jaxvr.optics.integrator import AbstractIntegrator
 from jaxvr.optics.partition import Cursor
@@ -26,10 +26,10 @@ from jaxvr.trace.base import AbstractTracer
 Array = jax.Array
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class Pipeline:
-    """What renders: nouns without arrays, so that it is a static argument. integrator, compositor:
-    None where segments are only recorded."""
+    """What renders: nouns, whose numbers are its leaves. integrator, compositor: None where
+    segments are only recorded."""
 
     tracer: AbstractTracer
     integrator: AbstractIntegrator | Any
@@ -42,6 +42,28 @@ class Operands(NamedTuple):
     scene: Any
     rays: Any
     table: Any
+
+
+class Asked(NamedTuple):
+    """What cotangents are wanted of. scene, rays, table: bools in place of leaves of `Operands`.
+    integrator, compositor: whether those of their own numbers are."""
+
+    scene: Any
+    rays: Any
+    table: Any
+    integrator: bool
+    compositor: bool
+
+
+class Cotangents(NamedTuple):
+    """Of operands and of nouns, each in the form of what it is of, with anything in place of
+    integers and of what is not asked for; None for a part of which nothing is."""
+
+    scene: Any
+    rays: Any
+    table: Any
+    integrator: Any
+    compositor: Any
 
 
 class March(NamedTuple):

@@ -6,6 +6,8 @@ depth S_i, the light from behind is the final sum minus the prefix (see `composi
 piece's cotangents are known there and then; they are pulled back through the slab integral to the
 slab's two control points and to the segment, and through the segment to the cell's four vertices
 and the ray. Only such local operands are differentiated, and their cotangents are scattered.
+Numbers of the integrator's and the compositor's own are operands of every piece: their cotangents
+are summed.
 
 Where the transfer function is transparent, light is neither added nor lost: the forward pass takes
 such a stretch in one piece, whatever control points lie in it. The backward pass does so only if no
@@ -36,7 +38,7 @@ import numpy as np
 
 from jaxvr._core.modes import constant, reverse_only
 from jaxvr._core.warn import warn
-from jaxvr.adjoint.base import AbstractAdjoint, Operands, Pipeline
+from jaxvr.adjoint.base import AbstractAdjoint, Asked, Operands, Pipeline
 
 Array = jax.Array
 
@@ -70,7 +72,8 @@ class Replay(AbstractAdjoint):
             warn(deprecated(f"Replay(native={self.native})", self.native), DeprecationWarning)
 
     def run(self, pipeline, operands, engine):
-        return _replay(engine, pipeline, reverse_only(operands, _FORWARD_MODE))
+        leaves, structure = jax.tree.flatten((pipeline, operands))
+        return _replay(engine, structure, reverse_only(tuple(leaves), _FORWARD_MODE))
 
 
 def deprecated(given: str, native: bool) -> str:
@@ -90,34 +93,85 @@ def _run(engine: Any, pipeline: Pipeline, operands: Operands):
     return engine.march(pipeline, operands)
 
 
+# The leaves of (pipeline, operands) go in flat: JAX would rebuild nouns of users with its own
+# objects in place of numbers, which their constructors may refuse.
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _replay(engine: Any, pipeline: Pipeline, operands: Operands) -> tuple[Any, Array]:
-    return _run(engine, pipeline, operands)
+def _replay(engine: Any, structure: Any, leaves: tuple[Array, ...]) -> tuple[Any, Array]:
+    return _run(engine, *structure.unflatten(leaves))
 
 
-def _forward(engine: Any, pipeline: Pipeline, primals: Any):
-    leaves, structure = jax.tree.flatten(
-        primals, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
-    )
-    operands = structure.unflatten([leaf.value for leaf in leaves])
-    found = _run(engine, pipeline, constant(operands, _SECOND))
-    return found, (operands, found[0], _flags([leaf.perturbed for leaf in leaves]))
+def _forward(engine: Any, structure: Any, primals: Any):
+    leaves = tuple(leaf.value for leaf in primals)
+    found = _run(engine, *structure.unflatten(constant(leaves, _SECOND)))
+    return found, (leaves, found[0], _flags([leaf.perturbed for leaf in primals]))
 
 
-def _backward(engine: Any, pipeline: Pipeline, residuals: Any, cotangents: Any):
-    operands, finals, asked = residuals
+def _backward(engine: Any, structure: Any, residuals: Any, cotangents: Any):
+    leaves, finals, flags = residuals
     state_bar = jax.tree.map(_cotangent, finals, cotangents[0])
-    structure = jax.tree.structure(operands)
-    perturbed: Operands = jax.tree.unflatten(structure, [flag.shape[0] == 1 for flag in asked])
-    optical = pipeline.compositor.shades and any(jax.tree.leaves(perturbed.table))
-    perturbed = perturbed._replace(table=jax.tree.map(lambda _: optical, perturbed.table))
+    pipeline, operands = structure.unflatten(leaves)
+    nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
+    asked = _asked(pipeline, operands, [flag.shape[0] == 1 for flag in flags])
     # Where it is transparent, segments have no gradient, but the transfer function has.
+    optical = any(jax.tree.leaves(asked.table)) or asked.integrator
     table = operands.table if optical else pipeline.integrator.shorten(operands.table, False)
     if not engine.traceable:
         state_bar = constant(state_bar, _SECOND)
     walked = operands._replace(table=table)
-    bar = engine.pull_back(pipeline, walked, finals, state_bar, perturbed)
-    return (Operands(*map(_as_cotangent, operands, bar)),)
+    bar = engine.pull_back(pipeline, walked, finals, state_bar, asked)
+    for noun, own, wanted in zip(nouns[1:], bar[3:], asked[3:], strict=True):
+        if wanted and own is None:
+            raise TypeError(
+                f"{type(engine).__name__}'s pull_back gives no derivative by the numbers of "
+                f"{type(noun).__name__}: take engine=jaxvr.engine.XLA()."
+            )
+    found = [_as_cotangent(nouns[0], None)]
+    found += map(_as_cotangent, (*nouns[1:], *operands), (*bar[3:], *bar[:3]))
+    return (tuple(leaf for part in found for leaf in part),)
+
+
+def _asked(pipeline: Pipeline, operands: Operands, perturbed: list[bool]) -> Asked:
+    """From bools for the leaves of both.
+
+    Raises TypeError where derivatives are asked for that no walk gives.
+    """
+    tracer, integrator, compositor = (
+        [perturbed.pop(0) for _ in jax.tree.leaves(noun)]
+        for noun in (pipeline.tracer, pipeline.integrator, pipeline.compositor)
+    )
+    scene, rays, table = jax.tree.unflatten(jax.tree.structure(operands), perturbed)
+    first = jax.tree.map(lambda x: x[0], operands.rays)
+
+    def refuse(noun: Any, where: str, instead: str) -> None:
+        raise TypeError(
+            f"Replay gives no derivatives by numbers of {type(noun).__name__} that its {where} "
+            f"uses: {instead}, or render with adjoint=Direct(max_steps)."
+        )
+
+    def moves(noun: Any) -> Any:
+        state = noun.start(operands.scene, first)
+        return noun.step(operands.scene, first, state, state.active)
+
+    if any(tracer) and _uses(moves, pipeline.tracer, tracer):
+        refuse(pipeline.tracer, "start or step", "hand them on in the scene, by prepare")
+    dtype = jax.tree.leaves(operands.table)[0].dtype
+    count = jax.tree.leaves(first)[0].shape[0]
+    if any(compositor) and _uses(lambda c: c.init(count, dtype), pipeline.compositor, compositor):
+        refuse(pipeline.compositor, "init", "use them in add or finish")
+    optical = pipeline.compositor.shades and any(jax.tree.leaves(table))
+    table = jax.tree.map(lambda _: optical, table)
+    return Asked(
+        scene, rays, table, pipeline.compositor.shades and any(integrator), any(compositor)
+    )
+
+
+def _uses(function: Any, noun: Any, asked: list[bool]) -> bool:
+    """Whether a function of a noun computes with those of its numbers."""
+    leaves, structure = jax.tree.flatten(noun)
+    traced = jax.make_jaxpr(lambda *x: function(structure.unflatten(x)))(*leaves).jaxpr
+    wanted = [v for v, a in zip(traced.invars, asked, strict=True) if a]
+    read = [v for equation in traced.eqns for v in equation.invars] + list(traced.outvars)
+    return any(v is w for v in read for w in wanted)
 
 
 def _cotangent(primal: Array, cotangent: Any) -> Array | None:
@@ -129,10 +183,10 @@ def _cotangent(primal: Array, cotangent: Any) -> Array | None:
     return cotangent
 
 
-def _as_cotangent(primal: Any, bar: Any) -> Any:
-    """The floats of `bar` at the float leaves of `primal`; zeros where there are none to put."""
+def _as_cotangent(primal: Any, bar: Any) -> list[Any]:
+    """Of the leaves of `primal`: the floats of `bar` for floats, zeros where there are none."""
     floats = [x for x in jax.tree.leaves(bar) if jnp.issubdtype(x.dtype, jnp.floating)]
-    leaves, structure = jax.tree.flatten(primal)
+    leaves = jax.tree.leaves(primal)
     wanted = sum(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves)
     if floats and len(floats) != wanted:
         raise ValueError(
@@ -146,7 +200,7 @@ def _as_cotangent(primal: Any, bar: Any) -> Any:
             out.append(np.zeros(leaf.shape, jax.dtypes.float0))
         else:
             out.append(next(source) if floats else jnp.zeros_like(leaf))
-    return structure.unflatten(out)
+    return out
 
 
 _replay.defvjp(_forward, _backward, symbolic_zeros=True)

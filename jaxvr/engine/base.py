@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import jax
 
-from jaxvr.adjoint.base import Operands, Pipeline
+from jaxvr.adjoint.base import Asked, Cotangents, Operands, Pipeline
 
 Array = jax.Array
 
@@ -41,18 +41,13 @@ class AbstractEngine(abc.ABC):
 
     @abc.abstractmethod
     def pull_back(
-        self, pipeline: Pipeline, operands: Operands, final: Any, cotangent: Any, asked: Operands
-    ) -> Operands:
-        """Cotangents of the operands of `march`.
+        self, pipeline: Pipeline, operands: Operands, final: Any, cotangent: Any, asked: Asked
+    ) -> Cotangents:
+        """Cotangents of what `march` was given.
 
         Args:
           final: the state that `march` gave, of this engine or another. cotangent: of it, with None
             in place of integers.
-          asked: bools in place of leaves, True for what a cotangent is wanted of.
-
-        Returns:
-          Operands in the form of `operands`, with anything in place of integers, and of what is not
-          asked for; None for a part of which nothing is.
         """
 
     @abc.abstractmethod

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxvr import native
-from jaxvr.adjoint.base import Operands
+from jaxvr.adjoint.base import Cotangents
 from jaxvr.engine.base import AbstractEngine
 from jaxvr.native.nouns import unwritten
 
@@ -47,10 +47,13 @@ class C(AbstractEngine):
         tracer = pipeline.tracer
         if optical:
             table_bar = pipeline.integrator.gradient_finish(operands.table, table_bar)
-        return Operands(
+        # Nouns in C have no numbers with derivatives of their own.
+        return Cotangents(
             tracer.scene_cotangent(operands.scene, scene_bar),
             tracer.rays_cotangent(operands.rays, rays_bar),
             table_bar,
+            None,
+            None,
         )
 
     def count(self, tracer, scene, rays):

@@ -20,10 +20,12 @@ import numpy as np
 
 from jaxvr import hints
 from jaxvr._core.checks import require_kind
+from jaxvr._core.pytree import noun, static
 from jaxvr._core.status import check
 from jaxvr.adjoint import AbstractAdjoint, Pipeline
 from jaxvr.arguments import (
     adjoint_of,
+    at_the_door,
     background_of,
     compositor_of,
     engine_of,
@@ -277,21 +279,22 @@ def _settled(nouns: Any, engine: Any, dtype: Any, cache: bool) -> tuple[Any, ...
     integrator, compositor, adjoint, tracer = nouns
     pipeline = Pipeline(Recorded() if cache else tracer, integrator, compositor)
     engine = engine_of(engine, adjoint, pipeline, dtype)
+    pipeline = at_the_door(Pipeline(tracer, integrator, compositor), dtype)
     if getattr(adjoint, "native", None) is not None:  # deprecated, and answered
         adjoint = dataclasses.replace(adjoint, native=None)
-    return integrator, compositor, adjoint, tracer, engine
+    return pipeline.integrator, pipeline.compositor, adjoint, pipeline.tracer, engine
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class Objective:
     """The loss of a batch under raw parameters; two of the same nouns compile once."""
 
-    loss: Callable[[Array, Array], Array]
+    loss: Callable[[Array, Array], Array] = static()
     integrator: AbstractIntegrator
     compositor: AbstractCompositor
-    adjoint: AbstractAdjoint
+    adjoint: AbstractAdjoint = static()
     tracer: AbstractTracer
-    engine: AbstractEngine
+    engine: AbstractEngine = static()
 
     @property
     def gradient(self) -> Callable[..., Any]:
@@ -322,7 +325,7 @@ def _see(
     )
 
 
-_predict = functools.partial(jax.jit, static_argnums=0)(_see)
+_predict = jax.jit(_see)
 
 
 def _value(
@@ -343,7 +346,7 @@ def _value(
     return loss + prior, status
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@jax.jit
 def _gradient(objective: Objective, raw: Any, *rest: Any) -> Any:
     return jax.value_and_grad(_value, has_aux=True)(raw, objective, *rest)
 

@@ -6,7 +6,6 @@ Rays are flat here, (N,); the loops make blocks of their own, which XLA's thread
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -14,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxvr.composite.over import Over
 from jaxvr.native.build import target_name
 from jaxvr.native.nouns import COMPOSITORS, TRACERS
 from jaxvr.numerics.rules import Rule, rule_for, thin_rule
@@ -145,12 +143,11 @@ def _dtype_of(scene: Any) -> Any:
 
 def _optics(pipeline: Any, operands: Any, dtype: Any) -> tuple[Any, ...]:
     table, compositor = operands.table, pipeline.compositor
-    enough = compositor.enough if isinstance(compositor, Over) else math.inf
     packing = COMPOSITORS[type(compositor)]
-    kind = packing.kind(compositor)
+    kind, enough = packing.kind(compositor), packing.enough(compositor)
     if not compositor.shades:
         rules = np.zeros((5, 0), dtype)
-        numbers = np.array([0, 0, 0, enough, kind], dtype)
+        numbers = _numbers([0, 0, 0, enough, kind], dtype)
         return jnp.zeros(1, dtype), jnp.zeros((2, 16), dtype), rules, rules, numbers
     if not packing.is_light:  # a place for lengths
         optical = table.optical.at[1:].set(0)
@@ -159,8 +156,15 @@ def _optics(pipeline: Any, operands: Any, dtype: Any) -> tuple[Any, ...]:
     rule = small or rule_for(dtype)
     thin = thin_rule(dtype)
     rows = (_rows(r).astype(dtype) for r in (rule, thin))
-    numbers = np.array([rule.depth, small is not None, thin.depth, enough, kind], dtype)
+    numbers = _numbers([rule.depth, small is not None, thin.depth, enough, kind], dtype)
     return table.position, slabs_of(table), *rows, numbers
+
+
+def _numbers(numbers: list[Any], dtype: Any) -> Any:
+    """(n,), some of which may be traced."""
+    if any(isinstance(x, jax.Array) for x in numbers):
+        return jnp.stack([jnp.asarray(x, dtype) for x in numbers])
+    return np.array(numbers, dtype)
 
 
 def _rows(rule: Rule) -> np.ndarray:

@@ -5,6 +5,7 @@ To cover another noun: write it in `src/`, and say here what it is to them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -34,17 +35,23 @@ class Calls(NamedTuple):
 class Packing(NamedTuple):
     """A compositor.
 
-    kind: from one, its `Compositor` of src/whole.h. has_place: whether it keeps integers (2, N).
+    kind: from one, its `Compositor` of src/whole.h. enough: from one, the optical depth at which
+    rays end. has_place: whether it keeps integers (2, N).
     state: from sums (8, N) and the integers. finals: from one, the state of rays (N,) and its
     cotangent, to sums (8, N), cotangents (4, N) and where the largest scalars are, (N,) or (0,).
     is_light: whether the sums hold colours.
     """
 
     kind: Callable[[Any], int]
+    enough: Callable[[Any], Any]
     has_place: bool
     is_light: bool
     state: Callable[[Array, Array], Any]
     finals: Callable[[Any, Any, Any], tuple[Array, Array, Array]]
+
+
+def _never(_: Any) -> float:
+    return math.inf
 
 
 def _nowhere() -> Array:
@@ -94,9 +101,9 @@ TRACERS: dict[type, Calls] = {
 }
 INTEGRATORS: tuple[type, ...] = (Analytic, Unshaded)
 COMPOSITORS: dict[type, Packing] = {
-    Over: Packing(lambda _: 0, False, True, _over_state, _over_finals),
-    XRay: Packing(lambda c: 1 if c.shades else 2, False, False, _xray_state, _xray_finals),
-    MaximumIntensity: Packing(lambda _: 3, True, False, _largest_state, _largest_finals),
+    Over: Packing(lambda _: 0, lambda c: c.enough, False, True, _over_state, _over_finals),
+    XRay: Packing(lambda c: 1 if c.shades else 2, _never, False, False, _xray_state, _xray_finals),
+    MaximumIntensity: Packing(lambda _: 3, _never, True, False, _largest_state, _largest_finals),
 }
 
 
@@ -105,9 +112,7 @@ def unwritten(tracer: Any, integrator: Any, compositor: Any) -> str | None:
     known = (*TRACERS, *INTEGRATORS, *COMPOSITORS)
     nouns = [noun for noun in (tracer, integrator, compositor) if noun is not None]
     others = [noun for noun in nouns if type(noun) not in known]
-    if others:
-        return f"There are none for {type(others[0]).__name__}."
     backwards = compositor is not None and compositor.backwards
-    if backwards or TRACERS[type(tracer)].reverse(tracer):
+    if backwards or (type(tracer) in TRACERS and TRACERS[type(tracer)].reverse(tracer)):
         return "They go front to back."
-    return None
+    return f"There are none for {type(others[0]).__name__}." if others else None

@@ -54,6 +54,7 @@ from jax import lax
 
 from jaxvr._core import status as bits
 from jaxvr._core.gather import load, take
+from jaxvr._core.pytree import noun, static
 from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment, turned
 from jaxvr.order import AbstractOrder, Centroid
@@ -151,7 +152,7 @@ class BufferState(NamedTuple):
     status: Array
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class KBuffer(AbstractTracer):
     """Faces sorted roughly, fragments sorted by a buffer of k entries a pixel (see the module).
 
@@ -176,10 +177,10 @@ class KBuffer(AbstractTracer):
       ValueError: if k is not a positive integer, or order or pairs are not what they may be.
     """
 
-    k: int = 6
-    order: AbstractOrder = Centroid()
-    pairs: Literal["cells", "closest"] = "cells"
-    reverse: bool = False
+    k: int = static(default=6)
+    order: AbstractOrder = static(default=Centroid())
+    pairs: Literal["cells", "closest"] = static(default="cells")
+    reverse: bool = static(default=False)
 
     def __post_init__(self):
         number = isinstance(self.k, numbers.Integral) and not isinstance(self.k, bool)

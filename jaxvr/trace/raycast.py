@@ -42,7 +42,7 @@ import jax.numpy as jnp
 from jaxvr._core import status as bits
 from jaxvr._core.gather import load, take
 from jaxvr._core.once import once
-from jaxvr._core.pytree import pytree
+from jaxvr._core.pytree import noun, pytree
 from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment
 from jaxvr.trace.base import AbstractTracer
@@ -140,7 +140,7 @@ class CastState(NamedTuple):
     left: Array
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class RayCast(AbstractTracer):
     """Cell to cell by adjacency, in lock step. Exact order; no ray is lost (see the module).
 

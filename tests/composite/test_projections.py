@@ -124,6 +124,7 @@ def test_replay_by_the_other_engine(compositor):
     def gradient(forward, backward, cotangent=None):
         forward, backward = (registry.engine_of(x) for x in (forward, backward))
         state, status = replay._run(forward, pipeline, operands)
+        leaves, structure = jax.tree.flatten((pipeline, operands))
         assert not np.asarray(status).any()
         if cotangent is None:
             cotangent = jax.tree.map(
@@ -136,10 +137,9 @@ def test_replay_by_the_other_engine(compositor):
             )
             if compositor == XRay("optical depth"):  # `finish` holds the length
                 cotangent = cotangent._replace(length=(jnp.zeros_like(cotangent.length[0]),) * 2)
-        leaves = jax.tree.leaves(operands)
         asked = replay._flags([jnp.issubdtype(x.dtype, jnp.floating) for x in leaves])
-        found = replay._backward(backward, pipeline, (operands, state, asked), (cotangent, None))
-        mesh_bar = found[0].scene.mesh
+        found = replay._backward(backward, structure, (leaves, state, asked), (cotangent, None))
+        mesh_bar = structure.unflatten(found[0])[1].scene.mesh
         return (mesh_bar.values, mesh_bar.coordinates), cotangent
 
     want, cotangent = gradient(False, False)
