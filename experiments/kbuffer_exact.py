@@ -27,9 +27,9 @@ def gradients(volume: Any, camera: Any, transfer: Any, tracer: Any, weights: Any
 
     def loss(values, points, transfer, camera):
         changed = volume.replace(values=values, points=points)
-        adjoint = jaxvr.Replay(native=False)
+        engine = jaxvr.engine.XLA()
         image, _ = jaxvr.render(
-            changed, camera, transfer, tracer=tracer, adjoint=adjoint, status=True
+            changed, camera, transfer, tracer=tracer, engine=engine, status=True
         )
         return jnp.sum(weights * image)
 
@@ -39,7 +39,7 @@ def gradients(volume: Any, camera: Any, transfer: Any, tracer: Any, weights: Any
 
 def compare(volume: Any, name: str, camera: Any, smaller: bool) -> list[dict[str, Any]]:
     transfer = transfer_of(volume)
-    exact = np.asarray(jaxvr.render(volume, camera, transfer, adjoint=jaxvr.Replay(native=False)))
+    exact = np.asarray(jaxvr.render(volume, camera, transfer, engine=jaxvr.engine.XLA()))
     weights = jnp.asarray(np.random.default_rng(0).normal(size=exact.shape), exact.dtype)
     reference = gradients(volume, camera, transfer, jaxvr.RayCast(), weights)
     k = jaxvr.measure_k(volume, camera).k

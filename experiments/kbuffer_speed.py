@@ -65,14 +65,14 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, views: int, repeat: int) ->
     sums: dict[str, list[float]] = {}
     for camera in viewpoints(volume, size)[-views:]:
         draw = partial(jaxvr.render, volume, camera, transfer, status=True)
-        jax_loops = jaxvr.Replay(native=False)
+        jax_loops = jaxvr.engine.XLA()
         tasks = {
             "k = 2": lambda: draw(tracer=jaxvr.KBuffer(k=2)),
             "k = 6": lambda: draw(tracer=jaxvr.KBuffer(k=6)),
             "k = 6, first vertex": lambda: draw(
                 tracer=jaxvr.KBuffer(k=6, order=jaxvr.order.FirstVertex())
             ),
-            "RayCast, JAX": lambda: draw(adjoint=jax_loops),
+            "RayCast, JAX": lambda: draw(engine=jax_loops),
             "RayCast, compiled": lambda: draw(),
             "sort by centroid": lambda: sort_by_centroid(volume.points, faces, camera.eye),
             "sort by first vertex": lambda: sort_by_first_vertex(

@@ -109,7 +109,7 @@ def run(volume: jaxvr.TetMesh, name: str, size: int, k: int, repeat: int) -> lis
         "sort": lambda: sort_all(scene, counts),
         "cover": lambda f=of_tiles(_cover, sort): f(scene, rays),
         "fragments": lambda: draw_all(scene, rays),
-        "shade": lambda: jaxvr.shade(segments, transfer, adjoint=jaxvr.Replay(native=False)),
+        "shade": lambda: jaxvr.shade(segments, transfer, engine=jaxvr.engine.XLA()),
         "render": lambda: jaxvr.render(volume, camera, transfer, tracer=tracer, status=True),
         "prepare": lambda f=jax.jit(tracer.prepare): f(volume),
         "entries by hierarchy": lambda: search_all(cast, cast_rays),

@@ -20,13 +20,13 @@ import jaxvr
 from experiments.common import camera_of, transfer_of, write_json
 
 
-def reserved(mesh: jaxvr.TetMesh, size: int, adjoint) -> int:
+def reserved(mesh: jaxvr.TetMesh, size: int, adjoint=None, engine=None) -> int:
     """Bytes of temporary buffers for the gradient of a size x size image."""
     transfer = jaxvr.TransferFunction([0.0, 0.5, 1.0], np.eye(3), [0.1, 2.0, 1.0])
     camera = jaxvr.Camera.orbit(mesh, width=size, height=size)
 
     def loss(transfer, mesh):
-        return jnp.sum(jaxvr.render(mesh, camera, transfer, adjoint=adjoint) ** 2)
+        return jnp.sum(jaxvr.render(mesh, camera, transfer, adjoint=adjoint, engine=engine) ** 2)
 
     compiled = jax.jit(jax.grad(loss)).lower(transfer, mesh).compile()
     analysis = compiled.memory_analysis()

@@ -184,10 +184,10 @@ class Judge:
         self.draws: dict[bool, Any] = {}
         self.slopes: dict[bool, Any] = {}
         for native in (True, False):
-            adjoint = jaxvr.Replay(native=native)
+            engine = jaxvr.engine.C() if native else jaxvr.engine.XLA()
 
-            def draw(m: Any, a: Any = adjoint) -> Any:
-                return jaxvr.render(m, self.camera, self.transfer, adjoint=a, status=True)
+            def draw(m: Any, e: Any = engine) -> Any:
+                return jaxvr.render(m, self.camera, self.transfer, engine=e, status=True)
 
             def slope(m: Any, d: Any = draw) -> Any:
                 of_values = lambda v: d(dataclasses.replace(m, values=v))  # noqa: E731
@@ -206,9 +206,9 @@ class Judge:
         }
 
     def traced(self, mesh: Any, native: bool) -> tuple[Any, Any]:
-        segments = jaxvr.trace(mesh, self.camera, native=native)
-        adjoint = jaxvr.Replay(native=native)
-        return jaxvr.shade(segments, self.transfer, adjoint=adjoint), segments.status
+        engine = jaxvr.engine.C() if native else jaxvr.engine.XLA()
+        segments = jaxvr.trace(mesh, self.camera, engine=engine)
+        return jaxvr.shade(segments, self.transfer, engine=engine), segments.status
 
     def ways(self) -> Iterator[tuple[str, str, bool, Callable[[Any], Any]]]:
         """What is done, how, by which loops, and the function."""

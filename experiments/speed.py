@@ -97,7 +97,7 @@ def fit_iteration(segments: Any, transfer: Any, image: Any) -> Callable[[], Any]
     parameters = Parameters.of(transfer)
     unit = jnp.mean(transfer.extinctions)
     inputs = parameters, unit, None, None, batches[0], np.zeros(2, transfer.dtype)
-    nouns = jaxvr.Analytic(), jaxvr.Over(), jaxvr.Replay(), jaxvr.RayCast()
+    nouns = jaxvr.Analytic(), jaxvr.Over(), jaxvr.Replay(), jaxvr.RayCast(), jaxvr.engine.C()
     gradient, raw = Objective(l1, *nouns).gradient, parameters.raw()
     once = Control(iterations=1, progress=False)
     rest = (1, None, 0.1, once, None, lambda n: {})
@@ -128,14 +128,12 @@ def all_tasks(mesh: Any, camera: Any, transfer: Any, segments: Any, image: Any) 
 
 def jax_loop(mesh: Any, camera: Any, transfer: Any, segments: Any) -> Tasks:
     """The same without the native kernel."""
-    replay: Any = jaxvr.Replay
-    trace: Any = jaxvr.trace
-    loop = replay(native=False)
+    loop = jaxvr.engine.XLA()
     tasks: Tasks = {
-        RENDER: lambda: jaxvr.render(mesh, camera, transfer, adjoint=loop),
-        **gradients(mesh, camera, transfer, adjoint=loop),
-        "trace": lambda: trace(mesh, camera, native=False).scalar,
-        SHADE: lambda: jaxvr.shade(segments, transfer, adjoint=loop),
+        RENDER: lambda: jaxvr.render(mesh, camera, transfer, engine=loop),
+        **gradients(mesh, camera, transfer, engine=loop),
+        "trace": lambda: jaxvr.trace(mesh, camera, engine=loop).scalar,
+        SHADE: lambda: jaxvr.shade(segments, transfer, engine=loop),
     }
     return {f"{name}, JAX loop": task for name, task in tasks.items()}
 

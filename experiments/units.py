@@ -108,20 +108,20 @@ class Picture:
 
     def __init__(self, dtype: str, size: int, parallel: bool = False, native: bool = True):
         self.setting = Setting(dtype, parallel, width=size, height=size)
-        self.adjoint = jaxvr.Replay(native=native)
+        self.engine = jaxvr.engine.C() if native else jaxvr.engine.XLA()
         weights = np.random.default_rng(1).normal(size=(size, size, 4)).astype(dtype)
         self.slopes = jax.jit(jax.grad(lambda numbers: (self.image(numbers) * weights).sum()))
 
     def image(self, numbers: dict[str, Any]) -> Any:
-        return self.setting.render(numbers, adjoint=self.adjoint)
+        return self.setting.render(numbers, engine=self.engine)
 
     def render(self, scalar: int, length: int) -> list[np.ndarray]:
         return [np.asarray(self.image(self.setting.scaled(scalar, length)))]
 
     def shade(self, scalar: int, length: int) -> list[np.ndarray]:
         mesh, camera, transfer = self.setting.parts(self.setting.scaled(scalar, length))
-        segments = jaxvr.trace(mesh, camera, native=self.adjoint.native)
-        return [np.asarray(jaxvr.shade(segments, transfer, adjoint=self.adjoint))]
+        segments = jaxvr.trace(mesh, camera, engine=self.engine)
+        return [np.asarray(jaxvr.shade(segments, transfer, engine=self.engine))]
 
     def gradient(self, scalar: int, length: int) -> list[np.ndarray]:
         numbers = self.setting.scaled(scalar, length)

@@ -12,16 +12,16 @@ has no gradient, depths and scalars are arithmetic on local data and have one. A
 shade many, since segments do not depend on the transfer function.
 
 Rooms, each importing only from those before it: `_core`, `numerics`, `volume`, `view`, `optics`,
-`order`, `trace`, `composite`, `native`, `adjoint`, `units`, `defaults`, `hints`, `render`, `probe`,
-`fit`, `files`, `testing`, `plot`, `pictures`, `interact`, `accessors`, `cli`. Those of `native` are
-compiled loops, which serve where they can with the same results; no other room imports from
-`testing`.
+`order`, `trace`, `composite`, `native`, `adjoint`, `engine`, `units`, `defaults`, `hints`,
+`render`, `probe`, `fit`, `files`, `testing`, `plot`, `pictures`, `interact`, `accessors`, `cli`.
+An *engine* runs the loops: those of JAX, or those in C of `native`, which serve where they can with
+the same results. No other room imports from `testing`.
 """
 
 from typing import TYPE_CHECKING
 
 import jaxvr._core.quiet  # noqa: F401, I001 (first, before anything imports JAX)
-from jaxvr import native, order, testing
+from jaxvr import engine, native, order, testing
 from jaxvr._core.status import RenderError, check
 from jaxvr.adjoint import Direct, Forward, Replay
 from jaxvr.composite import MaximumIntensity, Over, XRay
@@ -90,6 +90,7 @@ __all__ = [
     "check",
     "datasets",
     "default_transfer",
+    "engine",
     "explore",
     "fit",
     "fit_parameters",

@@ -19,9 +19,11 @@ from jaxvr._core.checks import (
     require_kind,
 )
 from jaxvr._core.offsets import FAR, Origin, is_single, relative, said
+from jaxvr._core.pytree import registered, with_leaves_of
 from jaxvr._core.warn import warn
-from jaxvr.adjoint import AbstractAdjoint, Replay
+from jaxvr.adjoint import AbstractAdjoint, Pipeline, Replay
 from jaxvr.composite import AbstractCompositor, Over
+from jaxvr.engine import ENGINES, XLA, AbstractEngine, C
 from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
 from jaxvr.optics.transfer import tell_coarse
 from jaxvr.optics.unshaded import Unshaded
@@ -33,6 +35,8 @@ from jaxvr.volume.integrity import require_mesh
 from jaxvr.volume.mesh import TetMesh
 
 Array = jax.Array
+
+NOUNS = ("tracer", "integrator", "compositor")
 
 
 def background_of(background: Any) -> Array | None:
@@ -169,6 +173,39 @@ def adjoint_of(adjoint: Any) -> AbstractAdjoint:
     return _noun("adjoint", adjoint, "run", Replay)
 
 
+def engine_of(
+    engine: Any, adjoint: AbstractAdjoint | None, pipeline: Pipeline, dtype: Any
+) -> AbstractEngine:
+    """The engine that runs a call. Asked outside of `jit`: a compiled function would keep the
+    answer that the environment and the backend gave once.
+
+    adjoint: None where nothing is differentiated. dtype: of the volume.
+    """
+
+    def refusal(chosen: Any) -> str | None:
+        # A user's own adjoint needs no base.
+        by_adjoint = getattr(adjoint, "refuses", lambda _: None)(chosen)
+        return by_adjoint or chosen.refuses(pipeline, dtype)
+
+    native = getattr(adjoint, "native", None)  # of Replay, deprecated
+    if native is not None:
+        if engine is not None:
+            raise ValueError(f"Pass engine=, or {adjoint!r}, which is deprecated, but not both.")
+        engine = C() if native else XLA()
+    if engine is None:
+        return next(e for e in ENGINES if e is ENGINES[-1] or refusal(e) is None)
+    engine = _noun("engine", engine, "march", XLA)
+    if reason := refusal(engine):
+        raise ValueError(f"engine={engine!r} cannot be used here: {reason}")
+    return engine
+
+
+def at_the_door(pipeline: Pipeline, dtype: Any) -> Pipeline:
+    """With numbers of nouns as arrays of the volume's dtype."""
+    nouns = {name: with_leaves_of(name, getattr(pipeline, name), dtype) for name in NOUNS}
+    return Pipeline(**nouns)
+
+
 def _noun(name: str, given: Any, method: str, usual: type, default: Any = None) -> Any:
     """What was given, or the default if that is None. It is known by a method: a user's own needs
     no base."""
@@ -178,12 +215,17 @@ def _noun(name: str, given: Any, method: str, usual: type, default: Any = None) 
         raise ValueError(
             f"{name} is the class {given.__name__}, not one of its objects: did you forget the ()?"
         )
+    if hasattr(given, method) and name in NOUNS:
+        return registered(name, given)
     if not hasattr(given, method):
         what = repr(given) if isinstance(given, str) else f"a {type(given).__name__}"
-        raise ValueError(
-            f"{name} must be an object such as jaxvr.{usual.__name__}(), but is {what}."
-        )
+        raise ValueError(f"{name} must be an object such as {_shown(usual)}(), but is {what}.")
     return given
+
+
+def _shown(kind: type) -> str:
+    room = "engine." if issubclass(kind, AbstractEngine) else ""
+    return f"jaxvr.{room}{kind.__name__}"
 
 
 def rays_of(origins: Any, directions: Any, volume: Any, near: Any = None, far: Any = None) -> Rays:

@@ -1,6 +1,6 @@
 """`probe`: the data behind a pixel. What lies along a ray, segment by segment, as arrays.
 
-A picture shows one colour a pixel. `probe` walks the same rays with the same loops as `render` and
+A picture shows one colour a pixel. `probe` walks the same rays as `render`, with JAX's loops, and
 keeps what passes by: which cell, from which distance to which, the scalars there, and what the
 segment adds to the colour at the eye. The contributions of a ray add up to its pixel.
 """
@@ -21,6 +21,7 @@ from jaxvr._core.offsets import absolute, bare
 from jaxvr._core.status import check
 from jaxvr.adjoint.base import Operands, Pipeline, advance, begin, busy, shade_piece
 from jaxvr.arguments import (
+    at_the_door,
     camera_of,
     integrator_of,
     rays_of,
@@ -134,6 +135,7 @@ def probe(
     directions = np.ldexp(directions, -np.frexp(largest)[1])
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     pipeline = Pipeline(tracer_of(tracer), integrator_of(integrator, Over()), Over())
+    pipeline = at_the_door(pipeline, volume.dtype)
     size = min(batch_size(volume.dtype), 1 << max(len(origins) - 1, 0).bit_length())
     parts, counts, status = [], [], []
     scene, table, units = _prepare(pipeline, bare(volume), bare(transfer))
@@ -183,7 +185,7 @@ def _pixels_of(pixels: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndar
     return row, column
 
 
-@partial(jax.jit, static_argnums=0)
+@jax.jit
 def _prepare(pipeline: Pipeline, volume: Any, transfer: Any) -> tuple[Any, Any, Units]:
     units = units_of(volume.points, volume.values, transfer.positions)
     volume, transfer = mesh_in(units, volume), transfer_in(units, transfer)
@@ -192,7 +194,7 @@ def _prepare(pipeline: Pipeline, volume: Any, transfer: Any) -> tuple[Any, Any, 
     return scene, pipeline.integrator.prepare(transfer, volume.dtype, longest), units
 
 
-@partial(jax.jit, static_argnums=0)
+@jax.jit
 def _count(tracer: AbstractTracer, scene: Any, origins: Array, directions: Array) -> Any:
     """Nodes, as many as segments or more, and status of R rays."""
     rays = tracer.prepare_rays(scene, Rays(origins, directions))
@@ -200,7 +202,7 @@ def _count(tracer: AbstractTracer, scene: Any, origins: Array, directions: Array
     return tuple(x[0] for x in found)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=1)
 def _walk(pipeline: Pipeline, most: int, scene: Any, table: Any, origins: Any, directions: Any):
     """Number of segments (R,), then of each, (R, most, ...): cell, distance of the back, length,
     scalars and contribution."""

@@ -4,9 +4,9 @@
 
 `render` is `shade(trace(...))` without storing the segments. Rays go in batches, square tiles
 of the image, so that the rays of a batch stay together. Integers and floats of volume,
-camera and transfer function are arguments of one compiled function: a new camera, transfer
-function or field does not compile again, a new mesh size, image size or number of control points
-does.
+camera, transfer function and nouns are arguments of one compiled function: a new camera, transfer
+function, field or number of a noun does not compile again, a new mesh size, image size or number of
+control points does.
 """
 
 from __future__ import annotations
@@ -22,20 +22,23 @@ import numpy as np
 from jax import lax
 
 from jaxvr import hints
-from jaxvr import native as compiled
 from jaxvr._core.checks import is_concrete
 from jaxvr._core.offsets import bare
+from jaxvr._core.pytree import refusing_derivatives, with_leaves_of
 from jaxvr._core.status import BROKEN, LOST, check
+from jaxvr._core.warn import warn
 from jaxvr.adjoint import AbstractAdjoint, Pipeline
 from jaxvr.adjoint.base import Operands, refusing
-from jaxvr.adjoint.replay import settle
+from jaxvr.adjoint.replay import deprecated
 from jaxvr.arguments import (
     adjoint_of,
+    at_the_door,
     background_of,
     between,
     camera_of,
     compositor_of,
     dtype_of,
+    engine_of,
     integrator_of,
     offset_of,
     rays_of,
@@ -45,11 +48,12 @@ from jaxvr.arguments import (
     volume_of,
 )
 from jaxvr.composite import AbstractCompositor, Scale
+from jaxvr.engine import XLA, AbstractEngine, C
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.trace import AbstractTracer, Recorded, Segments
 from jaxvr.trace.beam import are_rays
 from jaxvr.trace.integrity import unfit
-from jaxvr.trace.recorded import Nodes, Runs, fill, record
+from jaxvr.trace.recorded import Nodes, Runs
 from jaxvr.units import mesh_in, rays_in, transfer_in, units_of
 from jaxvr.view.camera import Camera
 from jaxvr.view.rays import Rays, flat
@@ -79,6 +83,7 @@ def render(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: Literal[False] = False,
@@ -95,6 +100,7 @@ def render(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: Literal[True],
@@ -111,6 +117,7 @@ def render(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: bool = False,
@@ -126,6 +133,7 @@ def render(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: bool = False,
@@ -140,10 +148,12 @@ def render(
       tracer: `RayCast()` if None. compositor: `Over()`, or `MaximumIntensity()`, `XRay()`.
         integrator: what the compositor has by default, `Analytic()` for light.
       adjoint: `Replay()`, for reverse mode; `Forward()` for forward mode, `Direct(...)` for both.
+      engine: what runs the loops, `jaxvr.engine.C()` or `jaxvr.engine.XLA()`; None takes C where it
+        does not refuse, asked at every call, or while tracing under your own `jit`.
       background: opaque linear RGB (3,) behind the volume; None leaves it transparent.
       budget: bytes for the state of the rays that march at once, beside the volume and the image;
         None takes what measured fastest, 0.5 MB on CPUs and 220 MB on accelerators in float32.
-        Compiled loops (see `jaxvr.native`) need 0.2 MB a core whatever it is.
+        Loops in C need 0.2 MB a core whatever it is.
       status: also return the status bits (height, width) int32 of the pixels, instead of raising
         what they say: see `jaxvr.check`.
 
@@ -151,10 +161,10 @@ def render(
       image (height, width, 4): premultiplied linear RGBA in the volume's dtype, row 0 on top.
 
     Raises:
-      ValueError: for NaN or infinite operands, a budget below one byte, or a compositor that goes
-        back to front with a tracer that cannot. RenderError: if a ray could not be followed, and
-        for scalars and lengths out of the range that `jaxvr.units` states. Of values only where
-        they are concrete, not inside your own `jit`.
+      ValueError: for NaN or infinite operands, a budget below one byte, a compositor that goes
+        back to front with a tracer that cannot, or an engine that refuses. RenderError: if a ray
+        could not be followed, and for scalars and lengths out of the range that `jaxvr.units`
+        states. Of values only where they are concrete, not inside your own `jit`.
 
     Warns, also only there, with a `jaxvr.ViewWarning` that says what a blank picture comes from, or
     that the field's range and the transfer function's do not fit, that the numbers may be opacities
@@ -167,7 +177,7 @@ def render(
     pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
     camera = camera_of(camera, volume_of(volume))
     transfer = transfer_of(transfer, volume, pipeline.compositor)
-    how = _how(pipeline, adjoint, budget, volume)
+    how = _how(pipeline, adjoint, engine, budget, volume)
     with refusing(how[1]):
         scene = bare(volume), bare(camera), bare(transfer)
         last = offset_of(volume), background_of(background)
@@ -194,6 +204,7 @@ def render_rays(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: Literal[False] = False,
@@ -213,6 +224,7 @@ def render_rays(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: Literal[True],
@@ -232,6 +244,7 @@ def render_rays(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: bool = False,
@@ -250,6 +263,7 @@ def render_rays(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
     status: bool = False,
@@ -277,7 +291,7 @@ def render_rays(
     pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
     rays = rays_of(origins, directions, volume_of(volume), near, far)
     transfer = transfer_of(transfer, volume, pipeline.compositor)
-    how = _how(pipeline, adjoint, budget, volume)
+    how = _how(pipeline, adjoint, engine, budget, volume)
     with refusing(how[1]):
         scene = bare(volume), rays, bare(transfer)
         last = offset_of(volume), background_of(background)
@@ -297,6 +311,7 @@ def trace(
     near: Any = None,
     far: Any = None,
     tracer: AbstractTracer | None = None,
+    engine: AbstractEngine | None = None,
     budget: int | None = None,
     native: bool | None = None,
 ) -> Segments:
@@ -305,8 +320,8 @@ def trace(
     Args:
       camera: a camera, or rays (origins, directions) with shapes (..., 3).
       near, far: as for `render_rays`; of a camera numbers or (height, width).
-      budget: as for `render`.
-      native: whether to use compiled loops (see `jaxvr.native`); None for where they can be used.
+      engine, budget: as for `render`.
+      native: deprecated: `engine=jaxvr.engine.C()` for True, `engine=jaxvr.engine.XLA()` for False.
 
     Returns:
       Segments, 8 bytes each in float32 (see `Segments`). They are constants: for gradients with
@@ -328,7 +343,13 @@ def trace(
         rays = rays_of(*camera, volume, near, far)
         shape, order = rays.origins.shape[:-1], np.arange(rays.origins.size // 3)
     rays = jax.tree.map(lambda x: x[order], flat(rays))
-    how = (tracer, compiled.covers(native, volume.dtype, tracer), _batch_size(budget, volume))
+    if native is not None:
+        warn(deprecated(f"trace(native={native})", native), DeprecationWarning)
+        if engine is not None:
+            raise ValueError("Pass engine=, or native=, which is deprecated, but not both.")
+        engine = C() if native else XLA()
+    engine = engine_of(engine, None, Pipeline(tracer, None, None), volume.dtype)
+    how = (with_leaves_of("tracer", tracer, volume.dtype), engine, _batch_size(budget, volume))
     offset, volume = volume.offset, bare(volume)
     counts, status = _count(*how, volume, rays)
     check(status)
@@ -362,6 +383,7 @@ def shade(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
     background: Any = None,
     budget: int | None = None,
 ) -> Array:
@@ -378,7 +400,7 @@ def shade(
     segments = segments_of(segments)
     pipeline = _pipeline(Recorded(), integrator, compositor)
     transfer = transfer_of(transfer, segments, pipeline.compositor)
-    how = _how(pipeline, adjoint, budget, segments)
+    how = _how(pipeline, adjoint, engine, budget, segments)
     with refusing(how[1]):
         last = offset_of(segments), background_of(background)
         image, bits = _shade(*how, bare(segments), bare(transfer), *last)
@@ -387,10 +409,14 @@ def shade(
     return unfit(segments, image)
 
 
-def _how(pipeline: Pipeline, adjoint: Any, budget: Any, volume: Any) -> tuple[Any, Any, int]:
-    """What a compiled function depends on beside shapes: nouns, which loops serve, rays at once."""
-    adjoint = settle(adjoint_of(adjoint), pipeline, dtype_of(volume))
-    return pipeline, adjoint, _batch_size(budget, volume)
+def _how(
+    pipeline: Pipeline, adjoint: Any, engine: Any, budget: Any, volume: Any
+) -> tuple[Any, Any, Any, int]:
+    """What a compiled function depends on beside shapes: nouns, the engine, rays at once."""
+    adjoint, dtype = adjoint_of(adjoint), dtype_of(volume)
+    engine = engine_of(engine, adjoint, pipeline, dtype)
+    pipeline = at_the_door(pipeline, dtype)
+    return pipeline, adjoint, engine, _batch_size(budget, volume)
 
 
 def _pipeline(
@@ -406,28 +432,28 @@ def _pipeline(
     return Pipeline(tracer, integrator, compositor)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _render(pipeline, adjoint, size, volume, camera, transfer, offset, background):
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def _render(pipeline, adjoint, engine, size, volume, camera, transfer, offset, background):
     # Under a user's own jit operands may be constants: XLA must not compute with them itself.
     volume, camera = lax.optimization_barrier((volume, camera))
     height, width = camera.height, camera.width
     rays = Rays(*(tile(x) for x in camera.local_rays()))
-    rgba, status = _run(pipeline, adjoint, size, volume, rays, transfer, offset)
+    rgba, status = _run(pipeline, adjoint, engine, size, volume, rays, transfer, offset)
     seen = lax.stop_gradient(rgba[:, 3]).max()  # for `hints`; a background hides it
     rgba = _over(untile(rgba, height, width), background)
     return rgba, untile(status[:, None], height, width)[..., 0], seen
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _render_rays(pipeline, adjoint, size, volume, rays, transfer, offset, background):
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def _render_rays(pipeline, adjoint, engine, size, volume, rays, transfer, offset, background):
     shape = rays.origins.shape[:-1]
     volume, rays = lax.optimization_barrier((volume, rays))
-    rgba, status = _run(pipeline, adjoint, size, volume, flat(rays), transfer, offset)
+    rgba, status = _run(pipeline, adjoint, engine, size, volume, flat(rays), transfer, offset)
     return _over(rgba, background).reshape(*shape, 4), status.reshape(shape)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _shade(pipeline, adjoint, size, segments, transfer, offset, background):
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def _shade(pipeline, adjoint, engine, size, segments, transfer, offset, background):
     segments = lax.optimization_barrier(segments)  # as above
     units = units_of(segments.length, segments.scalar, transfer.positions, parts=_PARTS)
     segments = dataclasses.replace(
@@ -443,38 +469,34 @@ def _shade(pipeline, adjoint, size, segments, transfer, offset, background):
     runs = Runs(runs.first, jnp.where(number < count, runs.end, runs.first))
     rays = pipeline.tracer.prepare_rays(scene, runs)
     scale = Scale(units.scalar, units.length, offset)
-    rgba = _finish(pipeline, adjoint, scene, rays, transfer, scale, count)[0]
+    rgba = _finish(pipeline, adjoint, engine, scene, rays, transfer, scale, count)[0]
     rgba = jnp.zeros_like(rgba).at[segments.order].set(rgba, unique_indices=True)
     return _over(rgba, background).reshape(*segments.shape, 4), units.status
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _count(tracer, native, size, volume, rays):
+@partial(jax.jit, static_argnums=(1, 2))
+def _count(tracer, engine, size, volume, rays):
     units = units_of(volume.points, volume.values)
     volume, rays = mesh_in(units, volume), rays_in(units, rays)
     scene = tracer.prepare(volume)
     rays, count = batches(size, rays)
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(rays)
-    found = compiled.kernels.count_nodes(scene, rays) if native else record(tracer, scene, rays)
-    number, status = (x.reshape(-1)[:count] for x in found)
+    number, status = (x.reshape(-1)[:count] for x in engine.count(tracer, scene, rays))
     return number, status | units.status
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 6))
-def _fill(tracer, native, size, volume, rays, start, total):
+@partial(jax.jit, static_argnums=(1, 2, 6))
+def _fill(tracer, engine, size, volume, rays, start, total):
     units = units_of(volume.points, volume.values)
     volume, rays = mesh_in(units, volume), rays_in(units, rays)
     scene = tracer.prepare(volume)
-    (rays, starts), _ = batches(size, (rays, start))
+    rays, _ = batches(size, rays)
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(rays)
-    if native:
-        nodes = compiled.kernels.fill_nodes(scene, rays, start, total)
-    else:
-        nodes = fill(tracer, scene, rays, starts, total)
+    nodes = engine.fill(tracer, scene, rays, start, total)
     return Nodes(nodes.scalar / units.scalar, nodes.length / units.length)
 
 
-def _run(pipeline, adjoint, size, volume, given, transfer, offset):
+def _run(pipeline, adjoint, engine, size, volume, given, transfer, offset):
     """rgba (R, 4) and status (R,) of R rays."""
     units = units_of(volume.points, volume.values, transfer.positions)
     volume, given = mesh_in(units, volume), rays_in(units, given)
@@ -483,32 +505,34 @@ def _run(pipeline, adjoint, size, volume, given, transfer, offset):
     rays, count = batches(size, given)
     rays = jax.vmap(partial(pipeline.tracer.prepare_rays, scene))(rays)
     scale = Scale(units.scalar, units.length, offset)
-    rgba, status = _finish(pipeline, adjoint, scene, rays, transfer, scale, count)
-    good = are_rays(given.origins.T, given.directions.T)
+    rgba, status = _finish(pipeline, adjoint, engine, scene, rays, transfer, scale, count)
     for end in (given.near, given.far):
         if end is not None:
             rgba = jnp.where(jnp.isnan(end)[:, None], jnp.nan, rgba)
+    good = are_rays(given.origins.T, given.directions.T)
     status = jnp.where(good, status, status | LOST)
-    good = _in_range(volume, getattr(adjoint, "native", False))
+    good = _in_range(volume, engine.confirms_cells)
     return rgba, jnp.where(good, status, BROKEN) | units.status
 
 
-def _in_range(volume: Any, compiled_loops: Any) -> Array:
-    """Whether integers () of a mesh name points and cells that it has. Compiled loops look at those
-    of cells themselves, as they load them."""
+def _in_range(volume: Any, confirmed: bool) -> Array:
+    """Whether integers () of a mesh name points and cells that it has; confirmed: an engine looks
+    at those of cells itself."""
     count = volume.cells.shape[0]
     good = jnp.all((volume.boundary >= 0) & (volume.boundary >> 4 < count))
-    if compiled_loops:
+    if confirmed:
         return good
     cells, words = volume.cells, volume.neighbors
     good = good & jnp.all((cells >= 0) & (cells < volume.points.shape[0]))
     return good & jnp.all((words >= -1) & (words >> 4 < count))
 
 
-def _finish(pipeline, adjoint, scene, rays, transfer, scale, count):
+def _finish(pipeline, adjoint, engine, scene, rays, transfer, scale, count):
+    nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
+    pipeline = Pipeline(*map(refusing_derivatives, nouns))
     longest = lax.stop_gradient(pipeline.tracer.longest(scene))
     table = pipeline.integrator.prepare(transfer, longest.dtype, longest)
-    state, status = adjoint.run(pipeline, Operands(scene, rays, table))
+    state, status = adjoint.run(pipeline, Operands(scene, rays, table), engine)
     compositor = pipeline.compositor
     shown = transfer if "transfer" in compositor.needs else None
     rgba = jax.vmap(lambda state: compositor.finish(state, shown, scale))(state)

@@ -26,7 +26,7 @@ PAGES = {
     "Cameras and pictures": ("view", "files"),
     "Transfer functions and integrators": ("optics",),
     "Tracers and orders": ("trace", "order"),
-    "Compositors and adjoints": ("composite", "adjoint", "native"),
+    "Compositors, adjoints and engines": ("composite", "adjoint", "engine", "native"),
     "Fitting": ("fit",),
     "Plots": ("plot",),
     "Notebooks": ("interact",),
@@ -40,7 +40,7 @@ MORE = {
         "jaxvr.optics.integrator.AbstractSlabIntegrator",
     ),
     "Tracers and orders": ("jaxvr.trace.base.AbstractTracer", "jaxvr.trace.recorded.Recorded"),
-    "Compositors and adjoints": (
+    "Compositors, adjoints and engines": (
         "jaxvr.composite.base.AbstractCompositor",
         "jaxvr.adjoint.base.AbstractAdjoint",
     ),

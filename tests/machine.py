@@ -77,7 +77,8 @@ class Scene:
         )  # fmt: skip
         self.background = rng.uniform(0, 1, 3).astype(dtype)
         self.cotangent = rng.uniform(0.5, 1.5, (recipe.size, recipe.size, 4)).astype(dtype)
-        self.how: dict[str, Any] = {"adjoint": jaxvr.Replay(native=recipe.native)}
+        engines = {None: None, True: jaxvr.engine.C(), False: jaxvr.engine.XLA()}
+        self.how: dict[str, Any] = {"engine": engines[recipe.native]}
         if recipe.tracer == "KBuffer":
             self.how["tracer"] = jaxvr.KBuffer(k=12)
         if recipe.extras:
@@ -109,8 +110,8 @@ class Scene:
 
     def segments(self) -> Any:
         tracer = self.how.get("tracer")
-        native = self.recipe.native if tracer is None else None
-        return jaxvr.trace(self.mesh, self.camera, tracer=tracer, native=native)
+        engine = self.how["engine"] if tracer is None else None
+        return jaxvr.trace(self.mesh, self.camera, tracer=tracer, engine=engine)
 
     def shaded(self, segments: Any) -> Any:
         how = {k: v for k, v in self.how.items() if k != "tracer"}

@@ -31,7 +31,7 @@ Program = Sequence[str | int]
 class Scene:
     """A small picture, and pullbacks of it by some of its operands.
 
-    native: as for `jaxvr.Replay`; False takes JAX's own loops.
+    native: True takes loops in C, False JAX's own, None what is taken by default.
     """
 
     def __init__(self, dtype: str, native: bool | None):
@@ -42,7 +42,7 @@ class Scene:
         self.transfer = jaxvr.TransferFunction(
             np.array([0.05, 0.37, 1.1]), colors, np.array([0.5, 2.0, 4.0]), dtype=dtype
         )
-        self.adjoint = jaxvr.Replay(native=native)
+        self.engine = None if native is None else jaxvr.engine.C() if native else jaxvr.engine.XLA()
         rng = np.random.default_rng(3)
         self.cotangent = rng.uniform(0.5, 1.5, (4, 4, 4)).astype(dtype)
 
@@ -58,7 +58,7 @@ class Scene:
             self.mesh.replace(**of["mesh"]),
             self.camera.replace(**of["camera"]),
             self.transfer.replace(**of["transfer"]),
-            adjoint=self.adjoint,
+            engine=self.engine,
         )
 
     def pullback(self, pattern: str):

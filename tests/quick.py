@@ -47,13 +47,13 @@ rounded_jit = functools.partial(
 # Functions of modules and their static arguments. (`jaxvr.render` and `jaxvr.probe` are functions.)
 STATIC = {
     "jaxvr.render": {
-        "_render": (0, 1, 2),
-        "_render_rays": (0, 1, 2),
-        "_shade": (0, 1, 2),
-        "_count": (0, 1, 2),
-        "_fill": (0, 1, 2, 6),
+        "_render": (1, 2, 3),
+        "_render_rays": (1, 2, 3),
+        "_shade": (1, 2, 3),
+        "_count": (1, 2),
+        "_fill": (1, 2, 6),
     },
-    "jaxvr.probe": {"_prepare": (0,), "_count": (0,), "_walk": (0, 1)},
+    "jaxvr.probe": {"_prepare": (), "_count": (), "_walk": (1,)},
     "jaxvr.trace.measure": {"_measure": (0, 1)},
 }
 

@@ -32,7 +32,7 @@ class Entry:
     derivatives. variant: the same class as another entry, or almost; crossed with all adjoints in
     `shade` only. only: names of the integrators that an adjoint can do, or None for all. follows: a
     tracer of the same segments, which is crossed with everything; here all adjoints will do, and
-    other data with one of them.
+    other data with one of them. engine: what runs an adjoint.
     """
 
     name: str
@@ -44,6 +44,7 @@ class Entry:
     reverse: bool = True
     only: tuple[str, ...] | None = None
     follows: str | None = None
+    engine: Any = None
 
     def can(self, integrator: Entry) -> bool:
         return self.only is None or integrator.name in self.only
@@ -77,11 +78,12 @@ INTEGRATORS = [
 ]
 
 ADJOINTS = [
-    Entry("Replay", lambda: jaxvr.Replay(native=False), forward=False),
+    Entry("Replay", jaxvr.Replay, forward=False, engine=jaxvr.engine.XLA()),
     Entry(
         "compiled",
-        lambda: jaxvr.Replay(native=True),
+        jaxvr.Replay,
         forward=False,
+        engine=jaxvr.engine.C(),
         only=("Analytic", "fast", "draft"),
     ),
     Entry("Direct", lambda: jaxvr.Direct(max_steps=64)),
@@ -106,6 +108,11 @@ def _box(location: str, dtype: str):
     if location == "corner":
         return mesh.replace(values=rng.uniform(0, 1, (mesh.n_tets, 4)), location="corner")
     return mesh
+
+
+def engine_of(compiled: bool | None) -> Any:
+    """C, XLA, or what is taken by default."""
+    return None if compiled is None else jaxvr.engine.C() if compiled else jaxvr.engine.XLA()
 
 
 MESHES = ["point", "cell", "corner"]
@@ -152,18 +159,19 @@ def combinations() -> Iterator[tuple[Entry, Entry, Entry, str]]:
                     yield tracer, integrator, adjoint, "point"
 
 
-def states(mesh, rays, transfer, compositor, adjoint, near, far):
+def states(mesh, rays, transfer, compositor, engine, near, far):
     """The compositor's state at the end of rays (origins, directions) (R, 3): leaves (..., R)."""
-    given = rays_of(*rays, mesh, near, far)
-    state, status = _states(compositor, adjoint, mesh, given, transfer)
+    origins, directions = rays
+    given = rays_of(origins, directions, mesh, near, far)
+    state, status = _states(engine, compositor, mesh, given, transfer)
     assert not np.asarray(status).any()
     return jax.tree.map(lambda x: x[0], state)
 
 
-@functools.partial(quick.jit, static_argnums=(0, 1))
-def _states(compositor, adjoint, mesh, rays, transfer):
+@functools.partial(quick.jit, static_argnums=0)
+def _states(engine, compositor, mesh, rays, transfer):
     tracer, integrator = jaxvr.RayCast(), compositor.default_integrator()
     scene = tracer.prepare(mesh)
     batch = jax.tree.map(lambda x: x[None], tracer.prepare_rays(scene, rays))
     table = integrator.prepare(transfer, mesh.dtype, tracer.longest(scene))
-    return adjoint.run(Pipeline(tracer, integrator, compositor), Operands(scene, batch, table))
+    return engine.march(Pipeline(tracer, integrator, compositor), Operands(scene, batch, table))

@@ -12,8 +12,8 @@ import jaxvr
 ROOT = Path(jaxvr.__file__).parent
 ROOMS = [
     "_core", "numerics", "volume", "view", "optics", "order", "trace", "composite", "native",
-    "adjoint", "arguments", "units", "defaults", "hints", "render", "probe", "fit", "shard",
-    "files", "testing", "plot", "pictures", "interact", "accessors", "cli", "__main__",
+    "adjoint", "engine", "arguments", "units", "defaults", "hints", "render", "probe", "fit",
+    "shard", "files", "testing", "plot", "pictures", "interact", "accessors", "cli", "__main__",
 ]  # fmt: skip
 FILES = sorted(p.relative_to(ROOT) for p in ROOT.rglob("*.py") if p.name != "__init__.py")
 
@@ -80,7 +80,7 @@ PUBLIC = """
 TetMesh read_mesh write_mesh read_plot3d Camera TransferFunction render render_rays trace
 shade fit psnr ssim datasets Analytic PartialPreIntegration PreIntegration Quadrature AverageColor
 ConstantExtinction RayCast KBuffer measure_k rasterize refine order Over Replay Direct Forward check
-probe default_transfer save_image turntable explore MaximumIntensity XRay
+probe engine default_transfer save_image turntable explore MaximumIntensity XRay
 """.split()
 
 

@@ -81,9 +81,9 @@ def arguments_of_replay(native: bool) -> tuple[tuple[Any, ...], Any]:
     """What `render` hands to `_replay`: its static arguments, and the operands."""
     handed: list[Any] = []
 
-    def catch(pipeline, compiled, operands):
-        handed.append((pipeline, compiled, jax.tree.map(jax.typeof, operands)))
-        return rule(pipeline, compiled, operands)
+    def catch(engine, structure, leaves):
+        handed.append((engine, structure, jax.tree.map(jax.typeof, leaves)))
+        return rule(engine, structure, leaves)
 
     rule = replay._replay
     mesh = registry.mesh_of("point", "float64")
@@ -91,11 +91,11 @@ def arguments_of_replay(native: bool) -> tuple[tuple[Any, ...], Any]:
         patch.setattr(replay, "_replay", catch)
         jax.clear_caches()
         transfer, camera = registry.transfer_of("float64"), registry.camera_of("float64")
-        how = jaxvr.Replay(native=native)
-        jax.eval_shape(lambda m: jaxvr.render(m, camera, transfer, adjoint=how), mesh)
+        how = registry.engine_of(native)
+        jax.eval_shape(lambda m: jaxvr.render(m, camera, transfer, engine=how), mesh)
         jax.clear_caches()
-    ((pipeline, compiled, operands),) = handed
-    return (pipeline, compiled), operands
+    ((*static, operands),) = handed
+    return tuple(static), operands
 
 
 # How each rule is called; a new one is one line here.

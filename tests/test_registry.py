@@ -101,6 +101,7 @@ def derivative(
         "integrator": ENTRIES[integrator].make(),
         "compositor": ENTRIES[compositor].make(),
         "adjoint": ENTRIES[adjoint].make(),
+        "engine": ENTRIES[adjoint].engine,
     }
 
     def image(args):
@@ -154,6 +155,7 @@ def shaded(integrator: str, adjoint: str, compositor: str = "Over", location: st
     moves[1] = jnp.where(segments.length == 0, 0, moves[1])  # jumps of the scalar stay jumps
     names = {"integrator": integrator, "compositor": compositor, "adjoint": adjoint}
     nouns = {noun: ENTRIES[name].make() for noun, name in names.items()}
+    nouns["engine"] = ENTRIES[adjoint].engine
 
     def image(args):
         scalar, length, transfer = args

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import registry
 
 import jaxvr
 from experiments.units import POWERS, Setting
@@ -37,11 +38,11 @@ def steps(dtype: str) -> list[tuple[int, int]]:
 @pytest.mark.parametrize("parallel", [False, True], ids=["pinhole", "parallel"])
 @pytest.mark.parametrize("native", [True, False], ids=["compiled", "jax"])
 def test_picture_has_the_same_bits_in_any_unit(dtype, parallel, native):
-    setting, adjoint = setting_of(dtype, parallel), jaxvr.Replay(native=native)
-    want = np.asarray(setting.render(setting.scaled(), adjoint=adjoint))
+    setting, engine = setting_of(dtype, parallel), registry.engine_of(native)
+    want = np.asarray(setting.render(setting.scaled(), engine=engine))
     assert np.ptp(want[..., 3]) > 0.5
     for scalar, length in steps(dtype):
-        got = setting.render(setting.scaled(scalar, length), adjoint=adjoint)
+        got = setting.render(setting.scaled(scalar, length), engine=engine)
         np.testing.assert_array_equal(got, want, err_msg=f"{scalar}, {length}")
 
 
@@ -95,16 +96,16 @@ def test_gradients_have_the_same_bits_in_any_unit(dtype):
 
 @pytest.mark.parametrize("native", [True, False])
 def test_out_of_range_is_told(dtype, native):
-    setting, adjoint = setting_of(dtype), jaxvr.Replay(native=native)
+    setting, engine = setting_of(dtype), registry.engine_of(native)
     b = SMALL[dtype]
     for exponent in (-b - 1, -b - 20):
         numbers = setting.scaled(exponent, 0)
         with pytest.raises(jaxvr.RenderError, match="scalars are too small.*unit.*values"):
-            setting.render(numbers, adjoint=adjoint)
+            setting.render(numbers, engine=engine)
     for exponent in (-b - 1, b + 1, b + 20):
         numbers = setting.scaled(0, exponent)
         with pytest.raises(jaxvr.RenderError, match="lengths are too small or too large.*unit"):
-            setting.render(numbers, adjoint=adjoint)
+            setting.render(numbers, engine=engine)
 
 
 @pytest.mark.parametrize("adjoint", [jaxvr.Direct(40), jaxvr.Forward()])

@@ -1,8 +1,8 @@
 """Adjoints: how gradients get back through the loop along a ray.
 
-An adjoint is an object that supplies the loop (`AbstractAdjoint.run`); everything else is the same
-for all of them, in `march`. This is the only room with `custom_vjp`, which would block forward
-mode elsewhere.
+An adjoint is an object that says how what an engine runs is differentiated (`AbstractAdjoint.run`);
+the steps along a ray are the same for all of them (`base`). This is the only room with
+`custom_vjp`, which would block forward mode elsewhere.
 
 | adjoint | modes | memory | when |
 |---|---|---|---|

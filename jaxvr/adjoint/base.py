@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import abc
 import contextlib
-import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -18,6 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core.modes import custom_vjp_refused
+from jaxvr._core.pytree import noun
 from jaxvr.composite.base import AbstractCompositor, Piece
 from jaxvr.optics.integrator import AbstractIntegrator
 from jaxvr.optics.partition import Cursor
@@ -26,13 +26,14 @@ from jaxvr.trace.base import AbstractTracer
 Array = jax.Array
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class Pipeline:
-    """What renders: nouns without arrays, so that it is a static argument."""
+    """What renders: nouns, whose numbers are its leaves. integrator, compositor: None where
+    segments are only recorded."""
 
     tracer: AbstractTracer
-    integrator: AbstractIntegrator
-    compositor: AbstractCompositor
+    integrator: AbstractIntegrator | Any
+    compositor: AbstractCompositor | Any
 
 
 class Operands(NamedTuple):
@@ -41,6 +42,28 @@ class Operands(NamedTuple):
     scene: Any
     rays: Any
     table: Any
+
+
+class Asked(NamedTuple):
+    """What cotangents are wanted of. scene, rays, table: bools in place of leaves of `Operands`.
+    integrator, compositor: whether those of their own numbers are."""
+
+    scene: Any
+    rays: Any
+    table: Any
+    integrator: bool
+    compositor: bool
+
+
+class Cotangents(NamedTuple):
+    """Of operands and of nouns, each in the form of what it is of, with anything in place of
+    integers and of what is not asked for; None for a part of which nothing is."""
+
+    scene: Any
+    rays: Any
+    table: Any
+    integrator: Any
+    compositor: Any
 
 
 class March(NamedTuple):
@@ -52,17 +75,34 @@ class March(NamedTuple):
 
 
 class AbstractAdjoint(abc.ABC):
-    """Supplies the loop along the rays, and thereby how it is differentiated.
+    """Says how what an engine runs is differentiated.
 
     no_forward_mode: one with a `custom_vjp` says here what gives forward mode instead.
     """
 
     no_forward_mode: ClassVar[str | None] = None
 
+    def refuses(self, engine: Any) -> str | None:
+        """None where it can work with an engine, else why not: a sentence for users."""
+        return None
+
     @abc.abstractmethod
-    def run(self, pipeline: Pipeline, operands: Operands) -> tuple[Any, Array]:
+    def run(self, pipeline: Pipeline, operands: Operands, engine: Any) -> tuple[Any, Array]:
         """The compositor's state at the end of each ray, leaves (batches, ..., R), and status
-        (batches, R). What `finish` makes of the state is differentiated by JAX."""
+        (batches, R). What `finish` makes of the state is differentiated by JAX.
+
+        engine: an `AbstractEngine`, which runs the loops.
+        """
+
+
+def traced_only(adjoint: Any, engine: Any) -> str | None:
+    """`AbstractAdjoint.refuses` of one that leaves all derivatives to JAX."""
+    if engine.traceable:
+        return None
+    return (
+        f"{type(adjoint).__name__} has JAX differentiate the loop along the rays, and this "
+        "engine's is not written in JAX: take engine=jaxvr.engine.XLA(), or adjoint=jaxvr.Replay()."
+    )
 
 
 def refusing(adjoint: Any) -> contextlib.AbstractContextManager[None]:

@@ -8,7 +8,15 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core import status
-from jaxvr.adjoint.base import AbstractAdjoint, begin, busy, iterate, result, run_batches
+from jaxvr.adjoint.base import (
+    AbstractAdjoint,
+    begin,
+    busy,
+    iterate,
+    result,
+    run_batches,
+    traced_only,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +27,8 @@ class Direct(AbstractAdjoint):
     Reverse mode stores every iteration of every ray, some hundred bytes each, so memory grows with
     the length of the longest ray: do not use it for images of large meshes. It always makes
     `max_steps` iterations. Rays that need more have the status `STEPS`, an error outside jit.
+
+    The loop is its own, of the steps that `jaxvr.engine.XLA` makes: no other engine can run it.
     """
 
     max_steps: int = 512
@@ -27,7 +37,10 @@ class Direct(AbstractAdjoint):
         if not isinstance(self.max_steps, int) or self.max_steps < 1:
             raise ValueError(f"max_steps must be a positive integer, but is {self.max_steps!r}.")
 
-    def run(self, pipeline, operands):
+    def refuses(self, engine):
+        return traced_only(self, engine)
+
+    def run(self, pipeline, operands, engine):
         def one(batch):
             def body(march, _):
                 march = lax.cond(

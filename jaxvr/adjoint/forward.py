@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from jaxvr._core.modes import forward_only
-from jaxvr.adjoint.base import AbstractAdjoint, march_while, result, run_batches
+from jaxvr.adjoint.base import AbstractAdjoint, traced_only
 
 _REVERSE = (
     "Forward gives forward mode (jvp, jacfwd, linearize) only. For reverse mode (grad, vjp, "
@@ -23,6 +23,8 @@ class Forward(AbstractAdjoint):
     others. For many parameters use `Replay`.
     """
 
-    def run(self, pipeline, operands):
-        found = run_batches(lambda one: result(march_while(pipeline, one)), operands)
-        return forward_only(found, _REVERSE)
+    def refuses(self, engine):
+        return traced_only(self, engine)
+
+    def run(self, pipeline, operands, engine):
+        return forward_only(engine.march(pipeline, operands), _REVERSE)

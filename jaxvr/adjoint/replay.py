@@ -6,6 +6,8 @@ depth S_i, the light from behind is the final sum minus the prefix (see `composi
 piece's cotangents are known there and then; they are pulled back through the slab integral to the
 slab's two control points and to the segment, and through the segment to the cell's four vertices
 and the ray. Only such local operands are differentiated, and their cotangents are scattered.
+Numbers of the integrator's and the compositor's own are operands of every piece: their cotangents
+are summed.
 
 Where the transfer function is transparent, light is neither added nor lost: the forward pass takes
 such a stretch in one piece, whatever control points lie in it. The backward pass does so only if no
@@ -33,23 +35,10 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
-from jaxvr import native
 from jaxvr._core.modes import constant, reverse_only
-from jaxvr.adjoint.base import (
-    AbstractAdjoint,
-    March,
-    Operands,
-    Pipeline,
-    advance,
-    begin,
-    busy,
-    march_while,
-    result,
-    run_batches,
-    shade_piece,
-)
+from jaxvr._core.warn import warn
+from jaxvr.adjoint.base import AbstractAdjoint, Asked, Operands, Pipeline
 
 Array = jax.Array
 
@@ -62,9 +51,6 @@ _SECOND = (
     "adjoint=Direct(max_steps) in any mode, and by adjoint=Forward() in forward mode (jvp of jvp)."
 )
 
-# Numbers in a table whose gradient is summed batch by batch.
-_SMALL_TABLE = 1 << 16
-
 
 @dataclasses.dataclass(frozen=True)
 class Replay(AbstractAdjoint):
@@ -74,19 +60,26 @@ class Replay(AbstractAdjoint):
     the render plus a walk that also differentiates, about two to four renders for the transfer
     function. Gradients that are not asked for are not computed. First derivatives only.
 
-    native: whether to use compiled loops (see `jaxvr.native`); None for where they can be used.
-        That is asked at every call of `render` and its like, outside of their own `jit`; under
-        yours it is asked while tracing, and the answer is compiled in.
+    native: deprecated: pass `engine=jaxvr.engine.C()` for True, `engine=jaxvr.engine.XLA()` for
+        False, to `render` and its like.
     """
 
     native: bool | None = None
     no_forward_mode: ClassVar[str] = _FORWARD_MODE
 
-    def run(self, pipeline, operands):
-        dtype = jax.tree.leaves(operands.table)[0].dtype
-        nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
-        compiled = native.covers(self.native, dtype, *nouns)
-        return _replay(pipeline, compiled, reverse_only(operands, _FORWARD_MODE))
+    def __post_init__(self):
+        if self.native is not None:
+            warn(deprecated(f"Replay(native={self.native})", self.native), DeprecationWarning)
+
+    def run(self, pipeline, operands, engine):
+        leaves, structure = jax.tree.flatten((pipeline, operands))
+        return _replay(engine, structure, reverse_only(tuple(leaves), _FORWARD_MODE))
+
+
+def deprecated(given: str, native: bool) -> str:
+    """What is said of an argument that named compiled loops (True) or JAX's own."""
+    name = "C" if native else "XLA"
+    return f"{given} is deprecated: pass engine=jaxvr.engine.{name}() to render and its like."
 
 
 def _flags(asked: Sequence[bool]) -> tuple[Array, ...]:
@@ -95,143 +88,90 @@ def _flags(asked: Sequence[bool]) -> tuple[Array, ...]:
     return tuple(jnp.zeros((int(flag), 0), bool) for flag in asked)
 
 
-def settle(adjoint: Any, pipeline: Pipeline, dtype: Any) -> Any:
-    """The adjoint with the loops that serve decided on: a part of what a compiled function depends
-    on, or a cached one would keep the answer that the environment and the backend gave once.
-
-    dtype: of the volume. Raises ValueError as `native.covers`.
-    """
-    if not isinstance(adjoint, Replay):
-        return adjoint
-    nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
-    return dataclasses.replace(adjoint, native=native.covers(adjoint.native, dtype, *nouns))
-
-
-def _run(pipeline: Pipeline, compiled: bool, operands: Operands):
+def _run(engine: Any, pipeline: Pipeline, operands: Operands):
     operands = operands._replace(table=pipeline.integrator.shorten(operands.table, True))
-
-    if compiled:
-        pixel, status = native.kernels.composite(pipeline, operands)
-        shape = jax.tree.leaves(operands.rays)[0].shape
-        return jax.tree.map(lambda x: _by_batch(x, shape), pixel), status.reshape(shape)
-    return run_batches(lambda one: result(march_while(pipeline, one)), operands)
+    return engine.march(pipeline, operands)
 
 
-def _by_batch(x: Array, shape: tuple[int, ...]) -> Array:
-    """(..., N) of N rays as (batches, ..., R) of batches of R."""
-    return jnp.moveaxis(x.reshape(*x.shape[:-1], *shape), -2, 0)
-
-
-def _flat(x: Array) -> Array:
-    """Back again."""
-    return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)
-
-
+# The leaves of (pipeline, operands) go in flat: JAX would rebuild nouns of users with its own
+# objects in place of numbers, which their constructors may refuse.
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _replay(pipeline: Pipeline, compiled: bool, operands: Operands) -> tuple[Any, Array]:
-    return _run(pipeline, compiled, operands)
+def _replay(engine: Any, structure: Any, leaves: tuple[Array, ...]) -> tuple[Any, Array]:
+    return _run(engine, *structure.unflatten(leaves))
 
 
-def _forward(pipeline: Pipeline, compiled: bool, primals: Any):
-    leaves, structure = jax.tree.flatten(
-        primals, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.CustomVJPPrimal)
-    )
-    operands = structure.unflatten([leaf.value for leaf in leaves])
-    found = _run(pipeline, compiled, constant(operands, _SECOND))
-    return found, (operands, found[0], _flags([leaf.perturbed for leaf in leaves]))
+def _forward(engine: Any, structure: Any, primals: Any):
+    leaves = tuple(leaf.value for leaf in primals)
+    found = _run(engine, *structure.unflatten(constant(leaves, _SECOND)))
+    return found, (leaves, found[0], _flags([leaf.perturbed for leaf in primals]))
 
 
-def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: Any):
-    operands, finals, asked = residuals
+def _backward(engine: Any, structure: Any, residuals: Any, cotangents: Any):
+    leaves, finals, flags = residuals
     state_bar = jax.tree.map(_cotangent, finals, cotangents[0])
-    tracer, integrator = pipeline.tracer, pipeline.integrator
-    structure = jax.tree.structure(operands)
-    perturbed: Operands = jax.tree.unflatten(structure, [flag.shape[0] == 1 for flag in asked])
-    optical = pipeline.compositor.shades and any(jax.tree.leaves(perturbed.table))
+    pipeline, operands = structure.unflatten(leaves)
+    nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
+    asked = _asked(pipeline, operands, [flag.shape[0] == 1 for flag in flags])
     # Where it is transparent, segments have no gradient, but the transfer function has.
-    table = operands.table if optical else integrator.shorten(operands.table, False)
-    if compiled:
+    optical = any(jax.tree.leaves(asked.table)) or asked.integrator
+    table = operands.table if optical else pipeline.integrator.shorten(operands.table, False)
+    if not engine.traceable:
         state_bar = constant(state_bar, _SECOND)
-        scene_bar, rays_bar, table_bar = native.kernels.pull_back(
-            *(pipeline, operands._replace(table=table)),
-            final=jax.tree.map(_flat, finals),
-            cotangent=jax.tree.map(_flat, state_bar),
-            asked=(perturbed.scene, perturbed.rays, optical),
-        )
-        rays_bar = _floats(tracer.rays_cotangent(operands.rays, rays_bar))
-    else:
-        walked = operands._replace(table=table)
-        scene_bar, rays_bar, table_bar = _walk_again(
-            pipeline, walked, finals, state_bar, perturbed, optical
-        )
-    scene_bar = _floats(tracer.scene_cotangent(operands.scene, scene_bar))
-    if optical:
-        table_bar = integrator.gradient_finish(operands.table, table_bar)
-    return (
-        Operands(
-            _as_cotangent(operands.scene, scene_bar),
-            _as_cotangent(operands.rays, rays_bar),
-            _as_cotangent(operands.table, _floats(table_bar)),
-        ),
+    walked = operands._replace(table=table)
+    bar = engine.pull_back(pipeline, walked, finals, state_bar, asked)
+    for noun, own, wanted in zip(nouns[1:], bar[3:], asked[3:], strict=True):
+        if wanted and own is None:
+            raise TypeError(
+                f"{type(engine).__name__}'s pull_back gives no derivative by the numbers of "
+                f"{type(noun).__name__}: take engine=jaxvr.engine.XLA()."
+            )
+    found = [_as_cotangent(nouns[0], None)]
+    found += map(_as_cotangent, (*nouns[1:], *operands), (*bar[3:], *bar[:3]))
+    return (tuple(leaf for part in found for leaf in part),)
+
+
+def _asked(pipeline: Pipeline, operands: Operands, perturbed: list[bool]) -> Asked:
+    """From bools for the leaves of both.
+
+    Raises TypeError where derivatives are asked for that no walk gives.
+    """
+    tracer, integrator, compositor = (
+        [perturbed.pop(0) for _ in jax.tree.leaves(noun)]
+        for noun in (pipeline.tracer, pipeline.integrator, pipeline.compositor)
     )
-
-
-def _walk_again(
-    pipeline: Pipeline,
-    operands: Operands,
-    finals: Any,
-    state_bar: Any,
-    perturbed: Operands,
-    optical: bool,
-) -> tuple[Any, list[Array], Any]:
-    """Gradients of the scene and the table as they are accumulated, and cotangents of the rays."""
-    tracer, integrator, compositor = pipeline.tracer, pipeline.integrator, pipeline.compositor
-    geometric = any(jax.tree.leaves((perturbed.scene, perturbed.rays)))
-
-    def batch(carry, inputs):
-        scene_bar, table_bar = carry
-        rays, final, pixel_bar = inputs
-        one = operands._replace(rays=rays)
-        _, rays_bar = tracer.gradient_start(one.scene, rays, (perturbed.scene, perturbed.rays))
-
-        def body(loop):
-            march, table_bar, trace_bar = loop
-            pixel, cursor, finished, piece, cut = shade_piece(pipeline, one, march)
-            segment, live = march.trace.segment, march.trace.active
-            bar = compositor.pull_back(piece, march.pixel, pixel, final, pixel_bar)
-            segment_bar = bar.segment
-            if compositor.shades:
-                none = jnp.zeros_like(segment.length)
-                piece_bar = (
-                    jnp.stack([none] * 3) if bar.rgb is None else jnp.where(live, bar.rgb, 0),
-                    none if bar.optical_depth is None else jnp.where(live, bar.optical_depth, 0),
-                )
-                by_light, table_bar = integrator.pull_back(
-                    one.table, segment, cut, piece_bar, table_bar
-                )
-                segment_bar = _sum(by_light, segment_bar)
-            if geometric:
-                trace_bar = tracer.pull_back(one.scene, rays, march.trace, segment_bar, trace_bar)
-            march = advance(pipeline, one, March(march.trace, cursor, pixel), finished)
-            return march, table_bar, trace_bar
-
-        # A small table's gradient is summed batch by batch first: a sum of millions of terms in
-        # float32 is then ten times as exact. A large one would cost more to clear than to add to.
-        own = small and integrator.gradient_start(operands.table)
-        loop = (begin(pipeline, one), own if small else table_bar, (scene_bar, rays_bar))
-        loop = lax.while_loop(lambda loop: busy(loop[0]), body, loop)
-        _, own, (scene_bar, rays_bar) = loop
-        table_bar = jax.tree.map(jnp.add, table_bar, own) if small else own
-        return (scene_bar, table_bar), _floats(tracer.rays_cotangent(rays, rays_bar))
-
+    scene, rays, table = jax.tree.unflatten(jax.tree.structure(operands), perturbed)
     first = jax.tree.map(lambda x: x[0], operands.rays)
-    scene_bar, _ = tracer.gradient_start(operands.scene, first, (perturbed.scene, perturbed.rays))
-    table_bar = integrator.gradient_start(operands.table) if optical else None
-    small = optical and sum(x.size for x in jax.tree.leaves(table_bar)) <= _SMALL_TABLE
-    (scene_bar, table_bar), rays_bar = lax.scan(
-        batch, (scene_bar, table_bar), (operands.rays, finals, state_bar)
+
+    def refuse(noun: Any, where: str, instead: str) -> None:
+        raise TypeError(
+            f"Replay gives no derivatives by numbers of {type(noun).__name__} that its {where} "
+            f"uses: {instead}, or render with adjoint=Direct(max_steps)."
+        )
+
+    def moves(noun: Any) -> Any:
+        state = noun.start(operands.scene, first)
+        return noun.step(operands.scene, first, state, state.active)
+
+    if any(tracer) and _uses(moves, pipeline.tracer, tracer):
+        refuse(pipeline.tracer, "start or step", "hand them on in the scene, by prepare")
+    dtype = jax.tree.leaves(operands.table)[0].dtype
+    count = jax.tree.leaves(first)[0].shape[0]
+    if any(compositor) and _uses(lambda c: c.init(count, dtype), pipeline.compositor, compositor):
+        refuse(pipeline.compositor, "init", "use them in add or finish")
+    optical = pipeline.compositor.shades and any(jax.tree.leaves(table))
+    table = jax.tree.map(lambda _: optical, table)
+    return Asked(
+        scene, rays, table, pipeline.compositor.shades and any(integrator), any(compositor)
     )
-    return scene_bar, rays_bar, table_bar
+
+
+def _uses(function: Any, noun: Any, asked: list[bool]) -> bool:
+    """Whether a function of a noun computes with those of its numbers."""
+    leaves, structure = jax.tree.flatten(noun)
+    traced = jax.make_jaxpr(lambda *x: function(structure.unflatten(x)))(*leaves).jaxpr
+    wanted = [v for v, a in zip(traced.invars, asked, strict=True) if a]
+    read = [v for equation in traced.eqns for v in equation.invars] + list(traced.outvars)
+    return any(v is w for v in read for w in wanted)
 
 
 def _cotangent(primal: Array, cotangent: Any) -> Array | None:
@@ -243,18 +183,16 @@ def _cotangent(primal: Array, cotangent: Any) -> Array | None:
     return cotangent
 
 
-def _sum(a: Any, b: Any) -> Any:
-    return a if b is None else jax.tree.map(jnp.add, a, b)
-
-
-def _floats(tree: Any) -> list[Array]:
-    """The float leaves, in order."""
-    return [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
-
-
-def _as_cotangent(primal: Any, floats: list[Array]) -> Any:
-    """Puts cotangents at the float leaves of `primal`; zeros where there are none to put."""
-    leaves, structure = jax.tree.flatten(primal)
+def _as_cotangent(primal: Any, bar: Any) -> list[Any]:
+    """Of the leaves of `primal`: the floats of `bar` for floats, zeros where there are none."""
+    floats = [x for x in jax.tree.leaves(bar) if jnp.issubdtype(x.dtype, jnp.floating)]
+    leaves = jax.tree.leaves(primal)
+    wanted = sum(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves)
+    if floats and len(floats) != wanted:
+        raise ValueError(
+            f"An engine's pull_back gave {len(floats)} cotangents for {wanted} float arrays: give "
+            "one for each, or None for all of them."
+        )
     source = iter(floats)
     out = []
     for leaf in leaves:
@@ -262,7 +200,7 @@ def _as_cotangent(primal: Any, floats: list[Array]) -> Any:
             out.append(np.zeros(leaf.shape, jax.dtypes.float0))
         else:
             out.append(next(source) if floats else jnp.zeros_like(leaf))
-    return structure.unflatten(out)
+    return out
 
 
 _replay.defvjp(_forward, _backward, symbolic_zeros=True)

@@ -2,12 +2,17 @@
 
 Of a ray's pieces p_1, p_2, ... a compositor makes states by `add`, and RGBA of the last by
 `finish`. It never sees the volume or the ray, so that any of them works with any tracer and any
-integrator. To add one, write a frozen dataclass without arrays that derives from
-`AbstractCompositor`, or from `AbstractSum`, in a file of its own; `composite.xray` is the shortest.
+integrator. To add one, write a frozen dataclass that derives from `AbstractCompositor`, or from
+`AbstractSum`, in a file of its own; `composite.xray` is the shortest. Its numbers are leaves,
+arrays of the volume's dtype in its methods, and the rest is static (`_core.pytree.noun`;
+`jax.tree_util.register_dataclass` for a user's own, and a class that is not registered is static as
+a whole).
 
 Gradients: `finish` is differentiated by JAX. So is `add` in forward mode and by the recording
 adjoint; the replaying one, which stores nothing along the ray, asks `pull_back` for the cotangents
-of each piece, from the states on both sides of it and the last one.
+of each piece, from the states on both sides of it and the last one. `add` and `finish` may use
+numbers of the compositor's own, with derivatives; where `init` does, the replaying adjoint refuses
+a gradient by them in words.
 """
 
 from __future__ import annotations
@@ -116,8 +121,11 @@ class AbstractCompositor(abc.ABC):
         equal to that of all pieces in turn to rounding."""
 
     @abc.abstractmethod
-    def pull_back(self, piece: Piece, before: Any, after: Any, final: Any, cotangent: Any) -> Piece:
-        """Cotangents of a piece.
+    def pull_back(
+        self, piece: Piece, before: Any, after: Any, final: Any, cotangent: Any
+    ) -> tuple[Piece, Any]:
+        """Cotangents of a piece, and of the compositor's own numbers by what `add` does with it:
+        a compositor with those in place of numbers, summed over rays, or None where they have none.
 
         Args:
           before, after: states without it and with it. final: that of the whole ray, from a walk
@@ -131,12 +139,13 @@ class AbstractSum(AbstractCompositor):
     cotangent is the same all along the ray, and `add` can be differentiated as it is."""
 
     def pull_back(self, piece, before, after, final, cotangent):
-        def floats(rgb, optical_depth, segment):
-            state = self.add(before, Piece(rgb, optical_depth, segment, piece.last))
+        def floats(own, rgb, optical_depth, segment):
+            state = own.add(before, Piece(rgb, optical_depth, segment, piece.last))
             return [x for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-        rgb, optical_depth, segment = jax.vjp(floats, *piece[:3])[1](jax.tree.leaves(cotangent))
-        return Piece(rgb, optical_depth, segment, None)
+        bars: Any = jax.vjp(floats, self, *piece[:3])[1](jax.tree.leaves(cotangent))
+        own_bar, rgb, optical_depth, segment = bars
+        return Piece(rgb, optical_depth, segment, None), own_bar
 
 
 def seen(piece: Piece) -> Array:

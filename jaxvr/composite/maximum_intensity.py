@@ -10,12 +10,12 @@ such rays without a word.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from jaxvr._core.pytree import noun
 from jaxvr.composite.base import AbstractCompositor, Piece, seen
 from jaxvr.optics.partition import Segment
 from jaxvr.optics.unshaded import Unshaded
@@ -33,7 +33,7 @@ class MaximumState(NamedTuple):
     passed: Array
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class MaximumIntensity(AbstractCompositor):
     """The colour that the transfer function has at the largest scalar along each ray, opaque; rays
     that meet nothing are transparent. Extinctions are not looked at.
@@ -87,7 +87,7 @@ class MaximumIntensity(AbstractCompositor):
         here = piece.last & (final.where // 2 == before.passed) & (final.where >= 0)
         at_back = final.where % 2 == 1
         front, back = (jnp.where(here & x, cotangent.largest, 0) for x in (~at_back, at_back))
-        return Piece(None, None, Segment(front, back, jnp.zeros_like(front)), None)
+        return Piece(None, None, Segment(front, back, jnp.zeros_like(front)), None), None
 
 
 def _exceeds(a: Array, b: Array) -> Array:

@@ -32,14 +32,15 @@ would cancel. Roundings then are those of what is left, and halve with each such
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import numbers
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 
+from jaxvr._core.checks import is_concrete
+from jaxvr._core.pytree import held, noun, static
 from jaxvr.composite.base import AbstractCompositor, Piece
 from jaxvr.numerics import compensated
 from jaxvr.numerics.compensated import Sum
@@ -50,6 +51,12 @@ Array = jax.Array
 Direction = Literal["front to back", "back to front"]
 
 
+_STEPS = (
+    "As a function of Over's termination a picture is made of steps: there is no derivative by it. "
+    "Take differences of pictures."
+)
+
+
 class OverState(NamedTuple):
     """depth: sums (R,), rgb: sums (3, R)."""
 
@@ -57,21 +64,23 @@ class OverState(NamedTuple):
     rgb: Sum
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class Over(AbstractCompositor):
     """Emission and absorption (the density emitter of Williams and Max 1992).
 
-    termination: a ray ends behind the first segment where its transmittance is at most this; 0
-    never ends one before its last segment, and costs nothing. What is left out is bounded, whatever
-    lies behind: |rgb - exact| is at most `termination` times the largest colour, and exact alpha -
-    alpha is from 0 to `termination`, both to rounding. 1/255 cannot be seen in 8 bits. Rays of a
-    batch go in lock step, so time is saved where all of them end early. All that is of segments in
-    order; a `KBuffer` with too small a k skips some, and of a ray that ends early it cannot always
-    tell.
+    termination: a ray ends behind the first segment where its transmittance is at most this; None,
+    or 0, which becomes None, never ends one before its last segment, and costs nothing. What is
+    left out is bounded, whatever lies behind: |rgb - exact| is at most `termination` times the
+    largest colour, and exact alpha - alpha is from 0 to `termination`, both to rounding. 1/255
+    cannot be seen in 8 bits. Rays of a batch go in lock step, so time is saved where all of them
+    end early. All that is of segments in order; a `KBuffer` with too small a k skips some, and of a
+    ray that ends early it cannot always tell.
 
     Gradients are those of the image that is rendered, with the cells where rays end held fixed:
     what lies behind them has none. As a function of the parameters that image has steps, of the
-    size of the bound, where a ray comes to end one cell sooner.
+    size of the bound, where a ray comes to end one cell sooner. As a function of `termination` it
+    is steps and nothing else, with a derivative of 0 that says nothing: one that is asked for is a
+    TypeError. Another number compiles nothing anew.
 
     direction: "front to back", or "back to front" as projected cells are composited: the same image
     and gradients to rounding, and no faster. It asks for a tracer that can stream segments from
@@ -82,12 +91,11 @@ class Over(AbstractCompositor):
         once: from behind, nothing is hidden yet.
     """
 
-    termination: float = 0.0
-    direction: Direction = "front to back"
+    termination: Any = held(_STEPS, default=None)
+    direction: Direction = static(default="front to back")
 
     def __post_init__(self):
-        number = isinstance(self.termination, numbers.Real)
-        if not (number and 0 <= self.termination < 1):
+        if not _is_fraction(self.termination):
             raise ValueError(
                 f"termination must be a number in [0, 1), but is {self.termination!r}. It is the "
                 "transmittance at which a ray ends: 0 follows every ray to its last segment, "
@@ -97,11 +105,13 @@ class Over(AbstractCompositor):
             raise ValueError(
                 f"direction must be one of {list(get_args(Direction))}, but is {self.direction!r}."
             )
-        if self.backwards and self.termination > 0:
+        if isinstance(self.termination, numbers.Real) and self.termination == 0:
+            object.__setattr__(self, "termination", None)
+        if self.backwards and self.termination is not None:
             raise ValueError(
                 f"termination is {self.termination} and direction 'back to front', but a ray that "
                 "comes from behind cannot end early: what hides the rest is seen last. Leave "
-                "termination at 0, or go front to back."
+                "termination out, or go front to back."
             )
 
     @property
@@ -131,12 +141,12 @@ class Over(AbstractCompositor):
         )
 
     @property
-    def enough(self) -> float:
-        """The optical depth at which a ray ends; infinite if none ends so."""
-        return -math.log(self.termination) if self.termination else math.inf
+    def enough(self) -> Any:
+        """The optical depth () at which a ray ends; infinite if none ends so."""
+        return math.inf if self.termination is None else -jnp.log(self.termination)
 
     def done(self, state):
-        if self.termination == 0:
+        if self.termination is None:
             return None
         return compensated.value(state.depth) >= self.enough
 
@@ -154,10 +164,24 @@ class Over(AbstractCompositor):
     def pull_back(self, piece, before, after, final, cotangent):
         rgb_bar, depth_bar = cotangent.rgb[0], cotangent.depth[0]
         if self.backwards:
-            return _pull_back_in_front(before, after, final, rgb_bar, depth_bar)
+            return _pull_back_in_front(before, after, final, rgb_bar, depth_bar), None
         behind = compensated.difference(final.rgb, after.rgb)
         through = compensated.exp_minus(before.depth)[None]
-        return Piece(through * rgb_bar, depth_bar - jnp.sum(rgb_bar * behind, axis=0), None, None)
+        piece_bar = Piece(
+            through * rgb_bar, depth_bar - jnp.sum(rgb_bar * behind, axis=0), None, None
+        )
+        return piece_bar, None
+
+
+def _is_fraction(x: Any) -> bool:
+    """Whether it is None or a number in [0, 1), as far as that is known."""
+    if x is None:
+        return True
+    if isinstance(x, numbers.Real):
+        return 0 <= float(x) < 1
+    if getattr(x, "shape", None) != () or not hasattr(x, "dtype") or x.dtype.kind not in "fiu":
+        return False
+    return not is_concrete(x) or 0 <= float(x) < 1
 
 
 def _add_in_front(state: OverState, rgb: Array, depth: Array) -> OverState:

@@ -12,12 +12,12 @@ volume.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 
+from jaxvr._core.pytree import noun, static
 from jaxvr._core.units import is_extreme, times_told
 from jaxvr.composite.base import AbstractSum
 from jaxvr.numerics import compensated
@@ -36,7 +36,7 @@ class XRayState(NamedTuple):
     length: Sum
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class XRay(AbstractSum):
     """The integral along each ray of the scalar or of the extinction.
 
@@ -58,7 +58,7 @@ class XRay(AbstractSum):
       ValueError: for another `of`.
     """
 
-    of: Of = "scalar"
+    of: Of = static(default="scalar")
 
     def __post_init__(self):
         if self.of not in get_args(Of):

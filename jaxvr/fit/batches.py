@@ -96,6 +96,7 @@ def gather_views(
     cache: bool,
     tracer: Any,
     background: Any,
+    engine: Any = None,
 ) -> Views:
     """Checked views: cameras with targets, traced if `cache`. Raises ValueError."""
     shapes = [_shape(c) for c in cameras]
@@ -115,7 +116,7 @@ def gather_views(
         if not cache:
             nodes = _rays(cameras, volume)
             return Views(shapes, flat.astype(dtype), nodes, _tile_rank(shapes), None)
-        parts = list(_trace(volume, cameras, tracer, dtype))
+        parts = list(_trace(volume, cameras, tracer, engine, dtype))
     first, end, before = [], [], 0
     for part, order in parts:
         start = np.asarray(part.start).astype(np.int64)
@@ -131,7 +132,7 @@ def gather_views(
     return Views(shapes, flat.astype(dtype), nodes, first, end, offset)
 
 
-def _trace(volume: Any, cameras: list[Any], tracer: Any, dtype: Any) -> Iterator[Any]:
+def _trace(volume: Any, cameras: list[Any], tracer: Any, engine: Any, dtype: Any) -> Iterator[Any]:
     """(Segments, pixel of each ray) of successive views.
 
     Cameras go together, so that one function is compiled for all, as many as 32-bit indices allow
@@ -149,7 +150,8 @@ def _trace(volume: Any, cameras: list[Any], tracer: Any, dtype: Any) -> Iterator
             continue
         tiles = np.argsort(_tile_rank([_shape(g) for g in group]))
         origins, directions = _rays(group, volume)
-        part = trace(here(volume), (origins[tiles], directions[tiles]), tracer=tracer)
+        rays = origins[tiles], directions[tiles]
+        part = trace(here(volume), rays, tracer=tracer, engine=engine)
         yield part, tiles[np.asarray(part.order)]
         group = []
 

@@ -66,7 +66,7 @@ def belongs(
             **named,
             "digests": digests | smooth,
             "programs": programs(),
-            "environment": environment(loops=digest.plain(objective.adjoint)),
+            "environment": environment(loops=digest.plain(objective.engine)),
         }
 
     return about

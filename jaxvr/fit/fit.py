@@ -20,13 +20,15 @@ import numpy as np
 
 from jaxvr import hints
 from jaxvr._core.checks import require_kind
+from jaxvr._core.pytree import noun, static
 from jaxvr._core.status import check
 from jaxvr.adjoint import AbstractAdjoint, Pipeline
-from jaxvr.adjoint.replay import settle
 from jaxvr.arguments import (
     adjoint_of,
+    at_the_door,
     background_of,
     compositor_of,
+    engine_of,
     integrator_of,
     require_positions,
     tracer_of,
@@ -34,6 +36,8 @@ from jaxvr.arguments import (
 )
 from jaxvr.composite import AbstractCompositor
 from jaxvr.defaults import diagonal
+from jaxvr.engine import AbstractEngine
+from jaxvr.fit import digest
 from jaxvr.fit.batches import Batch, Views, deal, gather_views, here, listed, make_batches
 from jaxvr.fit.belongs import belongs
 from jaxvr.fit.loop import Control, batch_number, prepare, run
@@ -82,6 +86,7 @@ def fit(
     integrator: AbstractIntegrator | None = None,
     compositor: AbstractCompositor | None = None,
     adjoint: AbstractAdjoint | None = None,
+    engine: AbstractEngine | None = None,
 ) -> FitResult:
     """Fits a transfer function to pictures of a volume.
 
@@ -115,9 +120,9 @@ def fit(
       progress, patience, tolerance, checkpoint, checkpoint_every, resume: as `fit_parameters`. What
         a checkpoint belongs to: the volume, the cameras, the targets, the start, what is free and
         its transforms, loss, smoothness, optimiser, background, seed, minibatches, cache, dtype,
-        tracer, integrator, compositor, adjoint, and all of it as one traced program.
+        tracer, integrator, compositor, adjoint, engine, and all of it as one traced program.
       callback: called after every step with (iteration, loss, transfer); True ends the fit.
-      tracer, integrator, compositor, adjoint: as `render`.
+      tracer, integrator, compositor, adjoint, engine: as `render`.
 
     Returns:
       FitResult: transfer, loss_history, images, report(), save(folder).
@@ -153,7 +158,7 @@ def fit(
         more, pictures_of_them = _pair(held_out)
         cameras, targets = cameras + listed(more), targets + pictures_of(pictures_of_them)
     every = gather_views(
-        volume, cameras, targets, cache=cache, tracer=tracer, background=background
+        volume, cameras, targets, cache=cache, tracer=tracer, engine=engine, background=background
     )
     require_positions(transfer, cameras[0] if volume is None else volume)
     seen, unseen = every.parted(number_seen)
@@ -165,7 +170,7 @@ def fit(
         look_at_targets(seen.split(seen.targets), parameters, background)
     dealt = deal(seen, rays, views, seed)
     batches, places = make_batches(seen, dealt)
-    objective = Objective(loss_of(loss), *_settled(nouns, dtype, cache))
+    objective = Objective(loss_of(loss), *_settled(nouns, engine, dtype, cache))
     weights = [_schedule(n, w) for n, w in _weights(smoothness, smoothness_extinctions)]
     mean = jnp.mean(parameters.transfer.extinctions)
     unit = jnp.where(mean > 0, mean, 1 / size).astype(dtype)
@@ -185,7 +190,9 @@ def fit(
     prepared = time.perf_counter() - begin
     named = {"free": list(parameters.transforms), "rays": len(places[0]), "loss": _name(loss)}
     about = belongs(
-        {"verb": "fit", "cache": bool(cache), "dtype": str(dtype)} | named,
+        {"verb": "fit", "cache": bool(cache), "dtype": str(dtype)}
+        | {"engine": digest.plain(engine)}
+        | named,
         objective,
         given,
         (volume, cameras[:number_seen], seen),
@@ -267,22 +274,27 @@ def _require_seen(compositor: AbstractCompositor, free: Any) -> None:
             )
 
 
-def _settled(nouns: Any, dtype: Any, cache: bool) -> tuple[Any, ...]:
-    """The nouns, with the loops that serve decided on before anything is compiled."""
+def _settled(nouns: Any, engine: Any, dtype: Any, cache: bool) -> tuple[Any, ...]:
+    """The nouns, and the engine that serves, decided on before anything is compiled."""
     integrator, compositor, adjoint, tracer = nouns
     pipeline = Pipeline(Recorded() if cache else tracer, integrator, compositor)
-    return integrator, compositor, settle(adjoint, pipeline, dtype), tracer
+    engine = engine_of(engine, adjoint, pipeline, dtype)
+    pipeline = at_the_door(Pipeline(tracer, integrator, compositor), dtype)
+    if getattr(adjoint, "native", None) is not None:  # deprecated, and answered
+        adjoint = dataclasses.replace(adjoint, native=None)
+    return pipeline.integrator, pipeline.compositor, adjoint, pipeline.tracer, engine
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class Objective:
     """The loss of a batch under raw parameters; two of the same nouns compile once."""
 
-    loss: Callable[[Array, Array], Array]
+    loss: Callable[[Array, Array], Array] = static()
     integrator: AbstractIntegrator
     compositor: AbstractCompositor
-    adjoint: AbstractAdjoint
+    adjoint: AbstractAdjoint = static()
     tracer: AbstractTracer
+    engine: AbstractEngine = static()
 
     @property
     def gradient(self) -> Callable[..., Any]:
@@ -302,6 +314,7 @@ def _see(
         "integrator": objective.integrator,
         "compositor": objective.compositor,
         "adjoint": objective.adjoint,
+        "engine": objective.engine,
         "background": background,
     }
     if isinstance(rays, Segments):
@@ -312,7 +325,7 @@ def _see(
     )
 
 
-_predict = functools.partial(jax.jit, static_argnums=0)(_see)
+_predict = jax.jit(_see)
 
 
 def _value(
@@ -333,7 +346,7 @@ def _value(
     return loss + prior, status
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@jax.jit
 def _gradient(objective: Objective, raw: Any, *rest: Any) -> Any:
     return jax.value_and_grad(_value, has_aux=True)(raw, objective, *rest)
 

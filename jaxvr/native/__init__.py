@@ -5,7 +5,7 @@ in C, one pass over a block of rays is a handful of vector loops whose operands 
 and XLA's own threads share the blocks. `src/` follows the JAX code line by line: the same signs of
 predicates, the same pieces and sums; numbers agree to rounding. JAX's loops stay the reference, and
 serve wherever these do not: on accelerators, for other integrators, tracers and adjoints, and where
-no C compiler is found.
+no C compiler is found. `jaxvr.engine.C` is how a pipeline gets here.
 
 A loop here is a function of the typed foreign function interface of XLA (`jax.ffi`), so that it
 works under a user's `jit` and `grad` (through `Replay`), and one after the other under `vmap`.
@@ -13,8 +13,7 @@ Ctrl-C ends these loops within a fraction of a second. It does not end JAX's own
 stop what it runs, so Python learns of it when the picture is done. Render fewer rays at a time, or
 end the process by another signal.
 
-`build` compiles and registers, `kernels` calls. To cover another noun: write it in `src/`, and say
-so in `covers`.
+`build` compiles and registers, `kernels` calls, `nouns` lists what is written and how it is packed.
 """
 
 from __future__ import annotations
@@ -24,14 +23,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxvr.composite import MaximumIntensity, Over, XRay
 from jaxvr.native import build, kernels
-from jaxvr.optics.analytic import Analytic
-from jaxvr.optics.unshaded import Unshaded
-from jaxvr.trace.raycast import RayCast
-from jaxvr.trace.recorded import Recorded
-
-_WRITTEN = (RayCast, Recorded, Analytic, Unshaded, Over, MaximumIntensity, XRay)
 
 
 def missing(dtype: Any = "float32") -> str | None:
@@ -45,27 +37,4 @@ def missing(dtype: Any = "float32") -> str | None:
     return build.load(name)
 
 
-def covers(wanted: bool | None, dtype: Any, *nouns: Any) -> bool:
-    """Whether compiled loops are to be used for these tracers, integrators and compositors.
-
-    wanted: None where they can be, False never, True always. dtype: of the volume. nouns: those of
-    the call.
-
-    Raises:
-      ValueError: if they are wanted and cannot be used, with the reason.
-    """
-    if wanted is False:
-        return False
-    others = [n for n in nouns if type(n) not in _WRITTEN]
-    if any(isinstance(n, Over) and n.backwards for n in nouns) or Recorded(reverse=True) in nouns:
-        reason = "They go front to back."
-    elif others:
-        reason = f"There are none for {type(others[0]).__name__}."
-    else:
-        reason = missing(dtype)
-    if wanted and reason:
-        raise ValueError(f"Compiled loops cannot be used here (native=True): {reason}")
-    return reason is None
-
-
-__all__ = ["covers", "kernels", "missing"]
+__all__ = ["kernels", "missing"]

@@ -6,7 +6,6 @@ Rays are flat here, (N,); the loops make blocks of their own, which XLA's thread
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -14,10 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxvr.composite.maximum_intensity import MaximumIntensity, MaximumState
-from jaxvr.composite.over import Over, OverState
-from jaxvr.composite.xray import XRay, XRayState
 from jaxvr.native.build import target_name
+from jaxvr.native.nouns import COMPOSITORS, TRACERS
 from jaxvr.numerics.rules import Rule, rule_for, thin_rule
 from jaxvr.optics.analytic import RULES
 from jaxvr.optics.partition import Nodes
@@ -34,23 +31,21 @@ PAIR = 10  # numbers of a row of `AbstractSlabIntegrator.gradient_start`
 
 def composite(pipeline: Any, operands: Any) -> tuple[Any, Array]:
     """The compositor's state and status (N,) of rays (N,), cast through a `CastScene` or played
-    back. pipeline, operands: as `adjoint.base` has them; what `covers` says."""
+    back. pipeline, operands: as `adjoint.base` has them, of what `nouns` lists."""
     scene, rays, _ = operands
     world, count = _world(scene, rays)
     dtype = _dtype_of(scene)
-    integers = Shape((2, count if _has_place(pipeline) else 0), jnp.int32)
+    packing = COMPOSITORS[type(pipeline.compositor)]
+    integers = Shape((2, count if packing.has_place else 0), jnp.int32)
     operands = (*world, *_optics(pipeline, operands, dtype))
     sums, status = Shape((8, count), dtype), Shape((count,), jnp.int32)
+    name = TRACERS[type(pipeline.tracer)].forward
     if isinstance(scene, Recording):
-        sums, integers = _call("shade", dtype, [sums, integers])(*operands)
+        sums, integers = _call(name, dtype, [sums, integers])(*operands)
         status = jnp.zeros(count, jnp.int32)
     else:
-        sums, status, integers = _call("render", dtype, [sums, status, integers])(*operands)
-    if isinstance(pipeline.compositor, MaximumIntensity):
-        return MaximumState(sums[0], integers[0], integers[1]), status
-    if isinstance(pipeline.compositor, XRay):
-        return XRayState((sums[0], sums[4]), (sums[1], sums[5])), status
-    return OverState((sums[0], sums[4]), (sums[1:4], sums[5:8])), status
+        sums, status, integers = _call(name, dtype, [sums, status, integers])(*operands)
+    return packing.state(sums, integers), status
 
 
 def pull_back(
@@ -68,7 +63,9 @@ def pull_back(
     world, count = _world(scene, rays)
     dtype = _dtype_of(scene)
     operands = (*world, *_optics(pipeline, operands, dtype))
-    operands = (*operands, *_finals(pipeline.compositor, final, cotangent))
+    packing = COMPOSITORS[type(pipeline.compositor)]
+    operands = (*operands, *packing.finals(pipeline.compositor, final, cotangent))
+    name = TRACERS[type(pipeline.tracer)].backward
     ask_scene, ask_rays, ask_table = asked
     rows = Shape((2 * table.position.shape[0] if ask_table else 0, PAIR), dtype)
 
@@ -77,7 +74,7 @@ def pull_back(
 
     if isinstance(scene, Recording):
         shapes = [rows, *(sized(x, a) for x, a in zip(scene, ask_scene, strict=True))]
-        table_bar, *found = _call("shade_pull", dtype, shapes)(*operands)
+        table_bar, *found = _call(name, dtype, shapes)(*operands)
         scene_bar = Recording(*(x if a else None for x, a in zip(found, ask_scene, strict=True)))
         return scene_bar, None, table_bar if ask_table else None
     mesh, at_points = scene.mesh, scene.mesh.location == "point"
@@ -90,7 +87,7 @@ def pull_back(
         sized(mesh.values, (by_values or by_points) and not at_points),
         Shape((8, count if by_rays else 0), dtype),
     ]
-    table_bar, vertices, values, by_ray = _call("render_pull", dtype, shapes)(*operands)
+    table_bar, vertices, values, by_ray = _call(name, dtype, shapes)(*operands)
     values = vertices[:, 3] if at_points else values
     scene_bar = (
         values if by_values else None,
@@ -157,55 +154,30 @@ def _dtype_of(scene: Any) -> Any:
     return (scene.scalar if isinstance(scene, Recording) else scene.mesh.coordinates).dtype
 
 
-def _has_place(pipeline: Any) -> bool:
-    return isinstance(pipeline.compositor, MaximumIntensity)
-
-
-def _kind(compositor: Any) -> int:
-    """`Compositor` of src/whole.h."""
-    if isinstance(compositor, XRay):
-        return 1 if compositor.shades else 2
-    return 3 if isinstance(compositor, MaximumIntensity) else 0
-
-
-def _finals(compositor: Any, final: Any, cotangent: Any) -> tuple[Array, Array, Array]:
-    """Sums (8, N), cotangents (4, N) and where the largest scalars are, (N,) or (0,)."""
-    none = jnp.zeros(0, jnp.int32)
-    if isinstance(compositor, Over):
-        sums = [final.depth[0], *final.rgb[0], final.depth[1], *final.rgb[1]]
-        bars = [*cotangent.rgb[0], cotangent.depth[0]]
-        return jnp.stack(sums), jnp.stack(bars), none
-    if isinstance(compositor, MaximumIntensity):
-        zero = jnp.zeros_like(final.largest)
-        bars = [cotangent.largest, zero, zero, zero]
-        return jnp.stack([final.largest, *[zero] * 7]), jnp.stack(bars), final.where
-    (integral, lost), (length, missed) = final
-    zero = jnp.zeros_like(integral)
-    sums = [integral, length, zero, zero, lost, missed, zero, zero]
-    by_integral, by_length = cotangent.integral[0], cotangent.length[0]
-    bars = [by_integral, by_length, zero, zero]
-    if compositor.shades:  # the length has no derivative there, see `XRay.finish`
-        bars = [zero, zero, zero, by_integral]
-    return jnp.stack(sums), jnp.stack(bars), none
-
-
 def _optics(pipeline: Any, operands: Any, dtype: Any) -> tuple[Any, ...]:
     table, compositor = operands.table, pipeline.compositor
-    enough = compositor.enough if isinstance(compositor, Over) else math.inf
-    kind = _kind(compositor)
+    packing = COMPOSITORS[type(compositor)]
+    kind, enough = packing.kind(compositor), packing.enough(compositor)
     if not compositor.shades:
         rules = np.zeros((5, 0), dtype)
-        numbers = np.array([0, 0, 0, enough, kind], dtype)
+        numbers = _numbers([0, 0, 0, enough, kind], dtype)
         return jnp.zeros(1, dtype), jnp.zeros((2, 16), dtype), rules, rules, numbers
-    if isinstance(compositor, XRay):  # no light: a place for lengths
+    if not packing.is_light:  # a place for lengths
         optical = table.optical.at[1:].set(0)
         table = dataclasses.replace(table, optical=optical)
     small = RULES[pipeline.integrator.accuracy]
     rule = small or rule_for(dtype)
     thin = thin_rule(dtype)
     rows = (_rows(r).astype(dtype) for r in (rule, thin))
-    numbers = np.array([rule.depth, small is not None, thin.depth, enough, kind], dtype)
+    numbers = _numbers([rule.depth, small is not None, thin.depth, enough, kind], dtype)
     return table.position, slabs_of(table), *rows, numbers
+
+
+def _numbers(numbers: list[Any], dtype: Any) -> Any:
+    """(n,), some of which may be traced."""
+    if any(isinstance(x, jax.Array) for x in numbers):
+        return jnp.stack([jnp.asarray(x, dtype) for x in numbers])
+    return np.array(numbers, dtype)
 
 
 def _rows(rule: Rule) -> np.ndarray:

@@ -8,8 +8,7 @@ domain: see `jaxvr.numerics.moments`.
 
 from __future__ import annotations
 
-import dataclasses
-
+from jaxvr._core.pytree import noun, static
 from jaxvr.numerics.moments import emission_weights
 from jaxvr.numerics.rules import DRAFT, FAST
 from jaxvr.optics.integrator import AbstractSlabIntegrator
@@ -17,7 +16,7 @@ from jaxvr.optics.integrator import AbstractSlabIntegrator
 RULES = {"full": None, "fast": FAST, "draft": DRAFT}
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class Analytic(AbstractSlabIntegrator):
     """Exact to rounding: rgb and alpha within 1e-15 (float64) or 5e-7 (float32) of the largest
     colour, and their Jacobian within 5e-15 or 7e-7 of its natural scale.
@@ -33,7 +32,7 @@ class Analytic(AbstractSlabIntegrator):
       ValueError: for another accuracy.
     """
 
-    accuracy: str = "full"
+    accuracy: str = static(default="full")
 
     def __post_init__(self):
         if self.accuracy not in RULES:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
+from jaxvr._core.pytree import noun
 from jaxvr.numerics.moments import opacity
 from jaxvr.optics.whole import AbstractEndIntegrator
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class AverageColor(AbstractEndIntegrator):
     """The mean of a segment's two end colours, behind the mean of its two extinctions.
 

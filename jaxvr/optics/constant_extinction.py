@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from math import factorial
 
 import jax
 import jax.numpy as jnp
 
+from jaxvr._core.pytree import noun
 from jaxvr.numerics.moments import opacity
 from jaxvr.optics.whole import AbstractEndIntegrator
 
@@ -29,7 +29,7 @@ def _back_weight(depth: Array) -> Array:
     return jnp.where(thin, series * small, opacity(large) / large - jnp.exp(-large))
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class ConstantExtinction(AbstractEndIntegrator):
     """Extinction constant along a segment, at the mean of its two ends, and colour linear.
 

@@ -1,6 +1,8 @@
 """What an integrator is: it turns segments into colour and optical depth, piece by piece.
 
-An integrator is a frozen dataclass without arrays, so that it can be a static argument of jit.
+An integrator is a frozen dataclass: its numbers are leaves, and the rest is static
+(`_core.pytree.noun`; `jax.tree_util.register_dataclass` for a user's own, and a class that is not
+registered is static as a whole). `prepare` and `step` may use the numbers, with derivatives.
 Tables that depend on the transfer function are made by `prepare` and travel as a pytree. To add an
 integrator of slabs, derive from `AbstractSlabIntegrator` and write `weights`; one that
 treats whole segments at once (a pre-integrated table) derives from `AbstractIntegrator`.
@@ -16,6 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxvr._core.pytree import noun
 from jaxvr._core.stage import stage
 from jaxvr.numerics.moments import opacity
 from jaxvr.optics.partition import (
@@ -194,7 +197,7 @@ class AbstractSlabIntegrator(AbstractIntegrator):
         return Nodes(nodes[:, 0], nodes[:, 1:].T)
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class SlabsFromBehind(AbstractSlabIntegrator):
     """The slabs of `other`, with light that leaves by the back.
 

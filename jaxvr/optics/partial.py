@@ -14,8 +14,7 @@ a ray that goes on into the next cell has nothing to look up. Both give the same
 
 from __future__ import annotations
 
-import dataclasses
-
+from jaxvr._core.pytree import noun, static
 from jaxvr.numerics.tables import gamma_weights, smooth_weights
 from jaxvr.optics.integrator import AbstractSlabIntegrator
 from jaxvr.optics.partition import with_texture
@@ -27,7 +26,7 @@ LOOKUPS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class PartialPreIntegration(AbstractSlabIntegrator):
     """Slab integrals from a table of psi, cut at control points like those of `Analytic`.
 
@@ -43,10 +42,10 @@ class PartialPreIntegration(AbstractSlabIntegrator):
       ValueError: for another lookup or way to find crossings, fewer than four nodes, or no texels.
     """
 
-    table_size: int = 128
-    lookup: str = "bicubic"
-    crossings: str = "slab"
-    texture_size: int = 512
+    table_size: int = static(default=128)
+    lookup: str = static(default="bicubic")
+    crossings: str = static(default="slab")
+    texture_size: int = static(default=512)
 
     def __post_init__(self):
         if self.lookup not in LOOKUPS:

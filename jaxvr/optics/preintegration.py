@@ -12,14 +12,13 @@ volume rendering" (Callahan et al.), doi:10.1109/VISUAL.2004.85 (Kraus et al.)
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxvr._core.pytree import pytree
+from jaxvr._core.pytree import noun, pytree, static
 from jaxvr._core.stage import stage
 from jaxvr.numerics.moments import emission_weights, opacity
 from jaxvr.optics.integrator import slab_of
@@ -46,7 +45,7 @@ class Frame:
     longest: Array
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class PreIntegration(AbstractWholeIntegrator):
     """One trilinear lookup a segment, however many control points it crosses.
 
@@ -75,11 +74,11 @@ class PreIntegration(AbstractWholeIntegrator):
         other bits.
     """
 
-    size: tuple[int, int, int] = (128, 128, 128)
-    scale: str = "linear"
-    incremental: bool = True
-    schedule: str = "halves"
-    bits: int | None = None
+    size: tuple[int, int, int] = static(default=(128, 128, 128))
+    scale: str = static(default="linear")
+    incremental: bool = static(default=True)
+    schedule: str = static(default="halves")
+    bits: int | None = static(default=None)
 
     def __post_init__(self):
         object.__setattr__(self, "size", tuple(self.size))

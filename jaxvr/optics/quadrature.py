@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvr._core.pytree import noun, static
 from jaxvr.optics.integrator import AbstractSlabIntegrator
 
 
@@ -49,7 +48,7 @@ def _riemann(a, b, samples):
 RULES = {"gauss-legendre": _gauss_legendre, "trapezoid": _trapezoid, "riemann": _riemann}
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class Quadrature(AbstractSlabIntegrator):
     """`samples` points on each slab; knows nothing of moments or error functions.
 
@@ -62,8 +61,8 @@ class Quadrature(AbstractSlabIntegrator):
       ValueError: for another rule, or if `samples` is not an integer >= 1 (2 for "trapezoid").
     """
 
-    rule: str = "gauss-legendre"
-    samples: int = 16
+    rule: str = static(default="gauss-legendre")
+    samples: int = static(default=16)
 
     def __post_init__(self):
         if self.rule not in RULES:

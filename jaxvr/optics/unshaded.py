@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 
+from jaxvr._core.pytree import noun
 from jaxvr.optics.integrator import AbstractIntegrator
 from jaxvr.optics.partition import Cursor
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class Unshaded(AbstractIntegrator):
     """One piece a segment, without colour and without optical depth."""
 

@@ -7,13 +7,12 @@ of a slab: the rows' cotangents are scattered, and no dense gradient of the tabl
 from __future__ import annotations
 
 import abc
-import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxvr._core.pytree import pytree
+from jaxvr._core.pytree import noun, pytree
 from jaxvr._core.stage import stage
 from jaxvr.optics.integrator import AbstractIntegrator, shade_slab, slab_of
 from jaxvr.optics.partition import Cursor, Ends, Segment, locate, nodes_of, turned
@@ -81,7 +80,7 @@ class AbstractWholeIntegrator(AbstractIntegrator):
         return gradient
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class WholeFromBehind(AbstractWholeIntegrator):
     """The segments of `other`, with light that leaves by the back."""
 

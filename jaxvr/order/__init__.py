@@ -6,7 +6,7 @@ the k-buffer puts right what is left (Callahan et al. 2005). How far from sorted
 what a buffer needs, is defined in `sequence`. `exact_order` makes a visibility order, for one mesh
 and one camera, on the host: to compare the others with.
 
-To add one, derive from `AbstractOrder`: a frozen dataclass, since tracers are static arguments.
+To add one, derive from `AbstractOrder`: a frozen dataclass, since it is static in a tracer.
 """
 
 from jaxvr.order.exact import ExactOrder, exact_order

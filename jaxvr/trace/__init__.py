@@ -1,8 +1,10 @@
 """Tracers: they turn a volume and rays into ordered streams of segments.
 
-A tracer is a frozen dataclass without arrays, split in the manner of an iterative method:
+A tracer is a frozen dataclass, whose numbers are leaves and the rest static (`_core.pytree.noun`),
+split in the manner of an iterative method:
 
-- `prepare(volume)` and `prepare_rays(...)` make the arrays that a step reads, differentiably;
+- `prepare(volume)` and `prepare_rays(...)` make the arrays that a step reads, differentiably; what
+  a step is to read of the tracer's own numbers goes into the scene, for derivatives by `Replay`;
 - `start` and `step` move rays (R,) from segment to segment, in lock step: a `state` shows the
   current segment, which rays have one (`active`), and which of those segments do not start at the
   scalar where the one before ended (`fresh`);

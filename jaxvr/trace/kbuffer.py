@@ -54,6 +54,7 @@ from jax import lax
 
 from jaxvr._core import status as bits
 from jaxvr._core.gather import load, take
+from jaxvr._core.pytree import noun, static
 from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment, turned
 from jaxvr.order import AbstractOrder, Centroid
@@ -80,6 +81,7 @@ from jaxvr.trace.local import (
     ROUNDING,
     Between,
     Side,
+    are_out,
     as_rays,
     as_scene,
     crossing_of_face,
@@ -153,7 +155,7 @@ class BufferState(NamedTuple):
     status: Array
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class KBuffer(AbstractTracer):
     """Faces sorted roughly, fragments sorted by a buffer of k entries a pixel (see the module).
 
@@ -178,10 +180,10 @@ class KBuffer(AbstractTracer):
       ValueError: if k is not a positive integer, or order or pairs are not what they may be.
     """
 
-    k: int = 6
-    order: AbstractOrder = Centroid()
-    pairs: Literal["cells", "closest"] = "cells"
-    reverse: bool = False
+    k: int = static(default=6)
+    order: AbstractOrder = static(default=Centroid())
+    pairs: Literal["cells", "closest"] = static(default="cells")
+    reverse: bool = static(default=False)
 
     def __post_init__(self):
         number = isinstance(self.k, numbers.Integral) and not isinstance(self.k, bool)
@@ -502,10 +504,7 @@ def _give(rays: BeamRays, state: BufferState, go: Array, done: Array, how: KBuff
     begin, end = lax.stop_gradient(at.z), lax.stop_gradient(two.z)
     # A segment of no length has a derivative, where that is not a matter of more than rounding: so
     # has one that ends at the eye, which the next makes up for.
-    unseen = sides[0].before & sides[1].before
-    if sides[0].beyond is not None:
-        unseen = unseen | (sides[0].beyond & sides[1].beyond)
-    flat = (segment.length == 0) & (after.lead == 0) & ~unseen
+    flat = (segment.length == 0) & (after.lead == 0) & ~are_out(sides)
     given = inside & ((segment.length > 0) | flat)
 
     buffer, left, drop = forget(buffer, first.words, pair, give, found, by_cells)

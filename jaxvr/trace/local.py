@@ -138,6 +138,13 @@ def side_of(depth: Any, interval: Interval) -> Side:
     return Side(z < (0 if near is None else near), None if far is None else z > far)
 
 
+def are_out(sides: tuple[Side, Side]) -> Array:
+    """Whether both ends (R,) lie outside of the interval on the same side: nothing is seen."""
+    (before, beyond), (too, also) = sides
+    out = before & too
+    return out if beyond is None or also is None else out | (beyond & also)
+
+
 def make_segment(
     reached: Reached,
     front: Array,
@@ -187,9 +194,8 @@ def _within(interval: Interval, start, end, front: Array, back: Array, chord, si
     z = start[0] + start[1], end[0] + end[1]
     begins, ends = sides
     near = jnp.zeros_like(z[0]) if interval.near is None else interval.near
-    outside, cut, at = begins.before & ends.before, [s.before for s in sides], [near, near]
+    outside, cut, at = are_out(sides), [s.before for s in sides], [near, near]
     if interval.far is not None:
-        outside = outside | (begins.beyond & ends.beyond)
         cut = [s.before | s.beyond for s in sides]
         at = [jnp.where(s.before, near, interval.far) for s in sides]
     cut = [c & ~outside for c in cut]

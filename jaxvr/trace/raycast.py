@@ -43,7 +43,7 @@ from jax import lax
 from jaxvr._core import status as bits
 from jaxvr._core.gather import load, take
 from jaxvr._core.once import once
-from jaxvr._core.pytree import pytree
+from jaxvr._core.pytree import noun, pytree, static
 from jaxvr._core.stage import stage
 from jaxvr.optics.partition import Segment
 from jaxvr.trace.base import AbstractTracer
@@ -143,7 +143,7 @@ class CastState(NamedTuple):
     left: Array
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class RayCast(AbstractTracer):
     """Cell to cell by adjacency, in lock step. Exact order; no ray is lost (see the module).
 
@@ -156,7 +156,7 @@ class RayCast(AbstractTracer):
         from behind is a ray: it comes the other way, and ends at the eye.
     """
 
-    reverse: bool = False
+    reverse: bool = static(default=False)
 
     def reversed(self) -> RayCast:
         return RayCast(not self.reverse)

@@ -12,7 +12,6 @@ by the same length, and a node of length 0 stays where it is; the next starts an
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxvr._core.brief import dtype_of, is_known
-from jaxvr._core.pytree import pytree, static
+from jaxvr._core.pytree import noun, pytree, static
 from jaxvr.optics.partition import Segment, turned
 from jaxvr.trace.base import AbstractTracer
 
@@ -86,14 +85,14 @@ class PlayState(NamedTuple):
     status: Array
 
 
-@dataclasses.dataclass(frozen=True)
+@noun
 class Recorded(AbstractTracer):
     """Plays back `Segments`. Gradients: with respect to their scalars and lengths.
 
     reverse: from behind; an `Over` that composites back to front sets it.
     """
 
-    reverse: bool = False
+    reverse: bool = static(default=False)
 
     def reversed(self) -> Recorded:
         return Recorded(not self.reverse)

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("quick_jit")
 @pytest.mark.parametrize("native", [False, True])
 def test_memory_of_replay_does_not_grow_with_cells_per_ray(native):
     short, long = (datasets.box((1, 1, n), dtype="float32") for n in (4, 40))
-    replay = [reserved(mesh, 32, jaxvr.Replay(native=native)) for mesh in (short, long)]
+    replay = [reserved(mesh, 32, engine=registry.engine_of(native)) for mesh in (short, long)]
     # Ten times the cells on a ray. What grows is the mesh and the hierarchy over its boundary, of
     # which there are copies; a hundred bytes for each cell of each ray would be 10 MB.
     boxes = jax.eval_shape(lambda m: jaxvr.RayCast().prepare(m).boxes, long)
@@ -55,9 +55,9 @@ def test_modes_that_an_adjoint_does_not_have_are_errors(image):
 class Own:
     """A user's own adjoint with a `custom_vjp`, and no base."""
 
-    def run(self, pipeline, operands):
-        replay = jaxvr.Replay(native=False)
-        own = jax.custom_vjp(lambda x: replay.run(pipeline, x))
+    def run(self, pipeline, operands, engine):
+        replay = jaxvr.Replay()
+        own = jax.custom_vjp(lambda x: replay.run(pipeline, x, engine))
         own.defvjp(lambda x: (own(x), None), lambda _, bar: (None,))
         return own(operands)
 

@@ -21,7 +21,7 @@ OPERANDS = {
     "values": lambda x, **how: jaxvr.render(MESH.replace(values=x), CAMERA, TRANSFER, **how),
 }
 START = {"extinctions": TRANSFER.extinctions, "values": MESH.values}
-REPLAYS = [jaxvr.Replay(), jaxvr.Replay(native=False)]
+ENGINES = [jaxvr.engine.C(), jaxvr.engine.XLA()]
 
 pytestmark = pytest.mark.usefixtures("quick_code")
 
@@ -34,11 +34,11 @@ def jvp(f):
     return lambda x: jax.jvp(f, (x,), (jnp.ones_like(x),))[1]
 
 
-@pytest.mark.parametrize("adjoint", REPLAYS, ids=["compiled", "jax"])
+@pytest.mark.parametrize("engine", ENGINES, ids=["compiled", "jax"])
 @pytest.mark.parametrize("under", [lambda f: f, jax.jit], ids=["plain", "jit"])
 @pytest.mark.parametrize("mode", [jvp, jax.jacfwd], ids=["jvp", "jacfwd"])
-def test_forward_mode_of_replay_names_forward(adjoint, under, mode):
-    f = loss("extinctions", adjoint=adjoint)
+def test_forward_mode_of_replay_names_forward(engine, under, mode):
+    f = loss("extinctions", engine=engine)
     with pytest.raises(TypeError, match=r"adjoint=Forward\(\)"):
         under(mode(f))(START["extinctions"])
 
@@ -50,12 +50,12 @@ def test_reverse_mode_of_forward_names_replay(under):
         under(jax.grad(f))(START["values"])
 
 
-@pytest.mark.parametrize("adjoint", REPLAYS, ids=["compiled", "jax"])
+@pytest.mark.parametrize("engine", ENGINES, ids=["compiled", "jax"])
 @pytest.mark.parametrize("name", OPERANDS)
 @pytest.mark.parametrize("second", [jvp, lambda g: jax.grad(lambda x: g(x).sum())])
-def test_second_derivatives_of_replay_are_refused(adjoint, name, second):
+def test_second_derivatives_of_replay_are_refused(engine, name, second):
     """Forward over reverse through JAX's loops gave numbers, wrong ones."""
-    gradient = jax.grad(loss(name, adjoint=adjoint))
+    gradient = jax.grad(loss(name, engine=engine))
     with pytest.raises(TypeError, match=r"first derivatives only.*Direct"):
         second(gradient)(START[name])
 

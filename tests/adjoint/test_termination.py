@@ -156,7 +156,7 @@ def test_the_replay_ends_rays_where_they_ended(dtype):
     assert np.array_equal(after.max(0), final[0])
 
 
-@pytest.mark.parametrize("termination", [-0.1, 1.0, 2, float("nan"), "0.1", None, np.zeros(2)])
+@pytest.mark.parametrize("termination", [-0.1, 1.0, 2, float("nan"), "0.1", [0.1], np.zeros(2)])
 def test_bad_thresholds_are_errors(termination):
     with pytest.raises(ValueError, match=r"termination must be a number in \[0, 1\), but is"):
         Over(termination)

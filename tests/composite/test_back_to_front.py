@@ -12,7 +12,7 @@ import pytest
 import registry
 
 import jaxvr
-from jaxvr import native
+from jaxvr.adjoint import Pipeline
 from jaxvr.composite import Over
 from jaxvr.trace import Recorded
 from tests.composite.test_over import fold, pieces, pixels, require_derivative
@@ -77,11 +77,12 @@ def test_what_cannot_be_had_from_behind_is_said():
     sideways: Any = "sideways"
     with pytest.raises(ValueError, match=r"direction must be one of .* but is 'sideways'"):
         Over(direction=sideways)
-    with pytest.raises(ValueError, match=r"native=True.*front to back"):
-        adjoint = jaxvr.Replay(native=True)
-        jaxvr.shade(jaxvr.trace(mesh, camera), transfer, compositor=BEHIND, adjoint=adjoint)
-    assert not native.covers(None, "float64", Recorded(), jaxvr.Analytic(), BEHIND)
-    assert not native.covers(None, "float64", Recorded(reverse=True), jaxvr.Analytic(), Over())
+    with pytest.raises(ValueError, match=r"engine=C\(\).*front to back"):
+        segments, engine = jaxvr.trace(mesh, camera), jaxvr.engine.C()
+        jaxvr.shade(segments, transfer, compositor=BEHIND, engine=engine)
+    for tracer, compositor in ((Recorded(), BEHIND), (Recorded(reverse=True), Over())):
+        pipeline = Pipeline(tracer, jaxvr.Analytic(), compositor)
+        assert jaxvr.engine.C().refuses(pipeline, "float64") == "They go front to back."
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,8 @@ def require_derivative(rgb, depth, over):
     for i in sorted(range(len(depth)), reverse=over.backwards):
         this = piece(rgb[i], depth[i])
         after = over.add(before, this)
-        found = over.pull_back(this, before, after, final, bar)
+        found, own = over.pull_back(this, before, after, final, bar)
+        assert own is None
         assert np.allclose(found.rgb, want[0][i], atol=1e-15)
         assert np.allclose(found.optical_depth, want[1][i], atol=1e-14)
         before = after

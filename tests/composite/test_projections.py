@@ -56,11 +56,11 @@ def test_against_brute_force(location, compiled, dtype):
     integral, chord, largest = brute(mesh, origins, directions)
     hit = chord > 0
     assert 8 <= hit.sum() < 30
-    adjoint = jaxvr.Replay(native=compiled)
+    engine = registry.engine_of(compiled)
     low, high = float(mesh.values.min()), float(mesh.values.max())
 
     def seen(compositor, transfer):
-        image = jaxvr.render(mesh, camera, transfer, compositor=compositor, adjoint=adjoint)
+        image = jaxvr.render(mesh, camera, transfer, compositor=compositor, engine=engine)
         assert image.dtype == mesh.dtype
         return np.asarray(image, np.float64).reshape(-1, 4)
 
@@ -85,11 +85,11 @@ def test_against_brute_force(location, compiled, dtype):
 def test_gradients_by_differences(compositor):
     """Of compiled loops; that JAX's give the same is asked below and in test_registry."""
     mesh, camera = registry.mesh_of("corner", "float64"), registry.camera_of("float64")
-    adjoint = jaxvr.Replay(native=True)
+    engine = jaxvr.engine.C()
 
     def image(values, points, camera, transfer):
         moved = mesh.replace(values=values, points=points)
-        return jaxvr.render(moved, camera, transfer, compositor=compositor, adjoint=adjoint)
+        return jaxvr.render(moved, camera, transfer, compositor=compositor, engine=engine)
 
     operands = {"values": mesh.values, "points": mesh.points, "camera": camera}
     smooth = jaxvr.TransferFunction(
@@ -123,7 +123,9 @@ def test_replay_by_the_other_engine(compositor):
     rng = np.random.default_rng(0)
 
     def gradient(forward, backward, cotangent=None):
-        state, status = replay._run(pipeline, forward, operands)
+        forward, backward = (registry.engine_of(x) for x in (forward, backward))
+        state, status = replay._run(forward, pipeline, operands)
+        leaves, structure = jax.tree.flatten((pipeline, operands))
         assert not np.asarray(status).any()
         if cotangent is None:
             cotangent = jax.tree.map(
@@ -136,10 +138,9 @@ def test_replay_by_the_other_engine(compositor):
             )
             if compositor == XRay("optical depth"):  # `finish` holds the length
                 cotangent = cotangent._replace(length=(jnp.zeros_like(cotangent.length[0]),) * 2)
-        leaves = jax.tree.leaves(operands)
         asked = replay._flags([jnp.issubdtype(x.dtype, jnp.floating) for x in leaves])
-        found = replay._backward(pipeline, backward, (operands, state, asked), (cotangent, None))
-        mesh_bar = found[0].scene.mesh
+        found = replay._backward(backward, structure, (leaves, state, asked), (cotangent, None))
+        mesh_bar = structure.unflatten(found[0])[1].scene.mesh
         return (mesh_bar.values, mesh_bar.coordinates), cotangent
 
     want, cotangent = gradient(False, False)
@@ -195,11 +196,11 @@ def test_offsets_and_units_come_back():
     exact = near.replace(values=values)
     want = jaxvr.render(exact, registry.camera_of("float64"), None, compositor=XRay())
     for compiled in ENGINES:
-        adjoint = jaxvr.Replay(native=compiled)
-        got = jaxvr.render(far, camera, None, compositor=XRay(), adjoint=adjoint)
+        engine = registry.engine_of(compiled)
+        got = jaxvr.render(far, camera, None, compositor=XRay(), engine=engine)
         assert np.max(np.abs(got - want)) < 1e-6 * np.max(want)
         transfer = ramp(101325.0, 101325.01)
-        red = jaxvr.render(far, camera, transfer, compositor=MaximumIntensity(), adjoint=adjoint)
+        red = jaxvr.render(far, camera, transfer, compositor=MaximumIntensity(), engine=engine)
         same = jaxvr.render(
             near.replace(values=values), camera, transfer, compositor=MaximumIntensity()
         )
@@ -282,9 +283,9 @@ def test_rays_through_vertices(compiled):
 
     def chords(points):
         moved = mesh.replace(points=points)
-        adjoint = jaxvr.Replay(native=compiled)
+        engine = registry.engine_of(compiled)
         return jaxvr.render_rays(
-            moved, origins, directions, None, compositor=XRay(), adjoint=adjoint
+            moved, origins, directions, None, compositor=XRay(), engine=engine
         )[:, 0]
 
     got, pull_back = jax.vjp(chords, mesh.points)
@@ -356,12 +357,12 @@ def test_a_scalar_that_is_none_is_seen(compiled):
     points = np.asarray(mesh.points)
     origins, directions = np.array([[0.31, 0.37, -1.0], [0.9, 0.9, -1.0]]), np.zeros((2, 3))
     directions[:] = 0.01, 0.007, 1.0
-    adjoint = jaxvr.Replay(native=compiled)
+    engine = registry.engine_of(compiled)
 
     @quick.jit
     def red(values):
         moved, transfer = mesh.replace(values=values), ramp(0, 1)
-        how = {"compositor": MaximumIntensity(), "adjoint": adjoint}
+        how = {"compositor": MaximumIntensity(), "engine": engine}
         return jaxvr.render_rays(moved, origins, directions, transfer, **how)[:, 0]
 
     fine = red(mesh.values)
@@ -411,8 +412,8 @@ def test_what_is_not_needed_is_not_given():
     for compositor, error in ((Blind(), TypeError), (Weighted("optical depth"), AttributeError)):
         for compiled in (None, False):
             with pytest.raises(error, match="None"):
-                adjoint = jaxvr.Replay(native=compiled)
-                jaxvr.render(mesh, camera, transfer, compositor=compositor, adjoint=adjoint)
+                engine = registry.engine_of(compiled)
+                jaxvr.render(mesh, camera, transfer, compositor=compositor, engine=engine)
 
 
 @pytest.mark.outside("bluntfin.vtu")

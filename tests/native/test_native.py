@@ -19,12 +19,13 @@ from jaxvr.numerics.rules import rule_for, thin_rule
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
+ENGINES = [jaxvr.engine.C(), jaxvr.engine.XLA()]
 EPS = {"float32": 5e-7, "float64": 1e-14}
 
 
 def both(function):
-    """`function(native)` with compiled loops and without."""
-    return [function(True), function(False)]
+    """`function(engine)` with compiled loops and without."""
+    return [function(engine) for engine in ENGINES]
 
 
 def test_the_default_is_compiled(dtype):
@@ -57,16 +58,12 @@ def test_a_ray_with_more_entries_than_a_search_keeps(layers):
     rng = np.random.default_rng(0)
     origins = np.concatenate([rng.uniform(0.2, 0.8, (50, 2)), np.full((50, 1), -1.0)], 1)
     directions = np.concatenate([rng.normal(0, 0.01, (50, 2)), np.ones((50, 1))], 1)
-    segments = [jaxvr.trace(layers, (origins, directions), native=n) for n in (True, False)]
+    segments = [jaxvr.trace(layers, (origins, directions), engine=n) for n in ENGINES]
     assert np.array_equal(segments[0].start, segments[1].start)
     assert segments[0].count > 50 * 12 * 2
     np.testing.assert_allclose(segments[0].scalar, segments[1].scalar, atol=1e-14)
     np.testing.assert_allclose(segments[0].length, segments[1].length, atol=1e-14)
-    images = both(
-        lambda n: jaxvr.render_rays(
-            layers, origins, directions, transfer, adjoint=jaxvr.Replay(native=n)
-        )
-    )
+    images = both(lambda n: jaxvr.render_rays(layers, origins, directions, transfer, engine=n))
     np.testing.assert_allclose(images[0], images[1], atol=1e-14)
 
 
@@ -78,9 +75,7 @@ def test_rays_of_all_directions_in_one_packet(dtype):
         [[0.0], [3.0], [-2.0]] * 111
     )
     images = both(
-        lambda n: jaxvr.render_rays(
-            mesh, origins.astype(dtype), directions, transfer, adjoint=jaxvr.Replay(native=n)
-        )
+        lambda n: jaxvr.render_rays(mesh, origins.astype(dtype), directions, transfer, engine=n)
     )
     np.testing.assert_allclose(images[0], images[1], atol=EPS[dtype])
     assert np.asarray(images[0])[::3, 3].min() > 0  # from inside
@@ -92,7 +87,7 @@ def test_thin_and_opaque_cells(extinction, dtype):
     """On both sides of where the rule of few nodes ends."""
     mesh, camera = registry.mesh_of("point", dtype), registry.camera_of(dtype)
     transfer = registry.transfer_of(dtype).scaled(extinction)
-    found = both(lambda n: jaxvr.render(mesh, camera, transfer, adjoint=jaxvr.Replay(native=n)))
+    found = both(lambda n: jaxvr.render(mesh, camera, transfer, engine=n))
     # Relative where all is thin, else to the rounding of what the cells in front let through.
     scale = float(np.max(found[1]))
     np.testing.assert_allclose(
@@ -135,7 +130,7 @@ def test_under_vmap_and_jit():
     scales = jnp.array([0.5, 2.0])
 
     def image(scale):
-        return jaxvr.render(mesh, camera, transfer.scaled(scale), adjoint=jaxvr.Replay(native=True))
+        return jaxvr.render(mesh, camera, transfer.scaled(scale), engine=jaxvr.engine.C())
 
     at_once = jax.jit(jax.vmap(image))(scales)
     np.testing.assert_allclose(at_once, jnp.stack([image(s) for s in scales]), atol=1e-15)
@@ -148,14 +143,14 @@ def test_what_they_do_not_cover_is_left_to_jax_or_said():
         jaxvr.render(
             *(mesh, camera, transfer),
             integrator=jaxvr.Quadrature(),
-            adjoint=jaxvr.Replay(native=True),
+            engine=jaxvr.engine.C(),
         )
-    assert native.covers(None, "float64", jaxvr.RayCast(), jaxvr.Quadrature()) is False
     assert native.missing("float16") is not None
 
 
 BROKEN = """
 import warnings
+import jax
 import jaxvr
 from jaxvr import native
 with warnings.catch_warnings(record=True) as said:
@@ -164,9 +159,12 @@ with warnings.catch_warnings(record=True) as said:
 assert {reason!r} in reason, reason
 assert [w.category.__name__ for w in said] == {categories}, said
 mesh = jaxvr.datasets.box((1, 1, 1), dtype="float32")
-assert not native.covers(None, "float32", jaxvr.RayCast())
+camera = jaxvr.Camera.orbit(mesh, width=4, height=4)
+transfer = jaxvr.default_transfer(mesh)
+code = jax.jit(lambda m: jaxvr.render(m, camera, transfer)).lower(mesh).as_text()
+assert "stablehlo.while" in code and "@jaxvr_" not in code
 try:
-    native.covers(True, "float32", jaxvr.RayCast())
+    jaxvr.trace(mesh, camera, engine=jaxvr.engine.C())
 except ValueError as error:
     assert {reason!r} in str(error)
 else:
@@ -203,9 +201,9 @@ def test_library_is_built_once(tmp_path, monkeypatch):
 def test_a_budget_does_not_change_the_image(dtype):
     mesh, camera = registry.mesh_of("point", dtype), registry.camera_of(dtype)
     transfer = registry.transfer_of(dtype)
-    adjoint = jaxvr.Replay(native=False)
-    whole = jaxvr.render(mesh, camera, transfer, adjoint=adjoint)
-    parts = jaxvr.render(mesh, camera, transfer, adjoint=adjoint, budget=7 * 212 * 8)
+    engine = jaxvr.engine.XLA()
+    whole = jaxvr.render(mesh, camera, transfer, engine=engine)
+    parts = jaxvr.render(mesh, camera, transfer, engine=engine, budget=7 * 212 * 8)
     np.testing.assert_allclose(whole, parts, atol=EPS[dtype])
     bad: list[Any] = [0, -5, "1 GB", float("inf"), float("nan")]
     for budget in bad:

@@ -24,7 +24,7 @@ for dtype in ("float32", "float64"):
     transfer = jaxvr.TransferFunction([0, 0.4, 1.3], np.eye(3), [0.5, 2, 4], dtype=dtype)
     def loss(values, points, transfer, camera):
         image = jaxvr.render(mesh.replace(values=values, points=points), camera, transfer,
-                             adjoint=jaxvr.Replay(native=True))
+                             engine=jaxvr.engine.C())
         return (image**2).sum()
     gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3)))
     found = jax.tree.leaves(gradient(mesh.values, mesh.points, transfer, camera))
@@ -59,8 +59,8 @@ camera = jaxvr.Camera.orbit(mesh, width=64, height=64)
 rays = [np.resize(np.asarray(x).reshape(-1, 3), (2_000_000, 3)) for x in camera.rays()]
 
 def draw():
-    adjoint = jaxvr.Replay(native=True)
-    return jax.block_until_ready(jaxvr.render_rays(mesh, *rays, transfer, adjoint=adjoint))
+    engine = jaxvr.engine.C()
+    return jax.block_until_ready(jaxvr.render_rays(mesh, *rays, transfer, engine=engine))
 
 draw()
 start = time.monotonic()

@@ -171,16 +171,16 @@ def test_faces_at_a_jump(lattice, eye):
     rays = origins, np.broadcast_to([-np.sign(eye), 0.011, 0.007], origins.shape)
     segments = jaxvr.trace(mesh, rays)
 
-    def loss(move, scalar, adjoint, compositor=None):
+    def loss(move, scalar, engine, compositor=None):
         moved = TransferFunction(tf.positions + move * jnp.array([0, 1, 1, 0]), tf.colors, EXT)
         played = dataclasses.replace(segments, scalar=scalar)
-        return jaxvr.shade(played, moved, adjoint=adjoint, compositor=compositor).sum()
+        return jaxvr.shade(played, moved, engine=engine, compositor=compositor).sum()
 
     EXT = tf.extinctions
     start = jnp.asarray(0.0), segments.scalar
     want = [float(loss(jnp.asarray(h), segments.scalar, None)) for h in (-1e-5, 1e-5)]
     behind = jaxvr.Over(direction="back to front")
-    kinds = [(jaxvr.Replay(native=None), None), (jaxvr.Replay(native=False), None), (None, behind)]
+    kinds = [(None, None), (jaxvr.engine.XLA(), None), (None, behind)]
     found = [jax.grad(loss, (0, 1))(*start, *kind) for kind in kinds]
     for by_move, by_scalar in found:
         assert float(by_move) == pytest.approx((want[1] - want[0]) / 2e-5, rel=1e-4)

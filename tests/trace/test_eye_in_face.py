@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("quick_code")
 
 HOW = {
     "compiled": {},
-    "jax": {"adjoint": jaxvr.Replay(native=False)},
+    "jax": {"engine": jaxvr.engine.XLA()},
     "k-buffer": {"tracer": jaxvr.KBuffer(k=12)},
     "from behind": {
         "tracer": jaxvr.KBuffer(k=12),
@@ -80,11 +80,11 @@ def test_by_the_eye_and_the_points(scene, name, quick_jit):
 def test_one_ray_alone(scene):
     """Whatever the other rays of its batch are in."""
     mesh, transfer, eyes, directions = scene
-    adjoint = jaxvr.Replay(native=False)
+    engine = jaxvr.engine.XLA()
 
     def gradient(eyes, directions):
         def total(eyes):
-            return jaxvr.render_rays(mesh, eyes, directions, transfer, adjoint=adjoint).sum()
+            return jaxvr.render_rays(mesh, eyes, directions, transfer, engine=engine).sum()
 
         return jax.grad(total)(eyes)
 

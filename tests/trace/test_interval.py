@@ -21,8 +21,8 @@ pytestmark = pytest.mark.usefixtures("quick_code")
 
 EPS = {"float32": 2.0**-23, "float64": 2.0**-52}
 HOW: dict[str, dict[str, Any]] = {
-    "compiled": {"adjoint": jaxvr.Replay(native=True)},
-    "jax": {"adjoint": jaxvr.Replay(native=False)},
+    "compiled": {"engine": jaxvr.engine.C()},
+    "jax": {"engine": jaxvr.engine.XLA()},
 }
 BEHIND = jaxvr.Over(direction="back to front")
 OTHERS: dict[str, dict[str, Any]] = {
@@ -92,7 +92,7 @@ def test_states_merge(how, dtype):
                 (origins, directions),
                 transfer,
                 compositor,
-                HOW[how]["adjoint"],
+                HOW[how]["engine"],
                 near=near,
                 far=far,
             )
@@ -238,10 +238,9 @@ def test_traced_segments_are_cut(compositor):
     want = jaxvr.render_rays(
         mesh, origins, directions, transfer, near=0.5 * places, far=places, compositor=compositor
     )
-    engines = (True, False) if compositor == jaxvr.Over() else (None,)
-    for native in engines:
+    for engine in (jaxvr.engine.C(), jaxvr.engine.XLA()):
         segments = jaxvr.trace(
-            mesh, (origins, directions), near=0.5 * places, far=places, native=native
+            mesh, (origins, directions), near=0.5 * places, far=places, engine=engine
         )
         got = jaxvr.shade(segments, transfer, compositor=compositor)
         assert np.max(np.abs(got - want)) < 20 * EPS[dtype]

@@ -27,7 +27,7 @@ BOTH = ("two points", "many points")
 # A k-buffer's segments do not depend on the transfer function, and forty entries take time.
 TRACERS = {
     "RayCast": (None, None, BOTH),
-    "RayCast, loops of JAX": (None, jaxvr.Replay(native=False), BOTH),
+    "RayCast, loops of JAX": (None, jaxvr.engine.XLA(), BOTH),
     "KBuffer": (jaxvr.KBuffer(k=40), None, BOTH[1:]),
 }
 
@@ -65,13 +65,13 @@ def rays(dtype: str):
 
 @pytest.mark.parametrize("tracer", TRACERS)
 def test_against_brute_force(tracer, dtype):
-    how, adjoint, names = TRACERS[tracer]
+    how, engine, names = TRACERS[tracer]
     transfers = testing.nasty_transfers(dtype=dtype)
     for name in names:
         worst = testing.assert_render_close(
             *(everything(dtype), rays(dtype), transfers[name]),
             tracer=how,
-            adjoint=adjoint,
+            engine=engine,
             atol=ATOL[dtype],
         )
         assert worst > 0

@@ -21,7 +21,7 @@ MESH = jaxvr.datasets.box((2, 2, 1), field=lambda p: p[:, 0] + 0.2 * p[:, 1], dt
 CAMERA = jaxvr.Camera.orbit(MESH, azimuth=31, elevation=17, width=4, height=3)
 TRANSFER = jaxvr.TransferFunction([0.0, 0.4, 1.3], np.eye(3), [0.5, 2.0, 4.0], dtype="float32")
 INTEGERS = ("cells", "neighbors", "boundary")
-ENGINES = {"compiled": jaxvr.Replay(), "jax": jaxvr.Replay(native=False)}
+ENGINES = {"compiled": None, "jax": jaxvr.engine.XLA()}
 
 pytestmark = pytest.mark.usefixtures("quick_code")
 
@@ -126,7 +126,7 @@ def test_segments_that_were_computed_with_are_told(name):
     with pytest.raises(ValueError, match=rf"segments\.{next(iter(change))}"):
         jaxvr.shade(broken, TRANSFER)
     if name in ("scaled", "places"):
-        shade = jax.jit(lambda s: jaxvr.shade(s, TRANSFER, adjoint=ENGINES["jax"]))
+        shade = jax.jit(lambda s: jaxvr.shade(s, TRANSFER, engine=ENGINES["jax"]))
         assert np.isnan(shade(broken)).all()
         assert np.isfinite(shade(segments)).all()
 
@@ -219,7 +219,7 @@ def test_points_that_mirror_while_traced_are_told(unit):
 
     def draw(points, status):
         mesh = MESH.replace(points=points)
-        return jaxvr.render(mesh, CAMERA, TRANSFER, adjoint=ENGINES["jax"], status=status)
+        return jaxvr.render(mesh, CAMERA, TRANSFER, engine=ENGINES["jax"], status=status)
 
     fits = jax.jit(lambda p: hold(MESH.replace(points=p), jnp.zeros((), jnp.int32)))
     assert int(fits(unit * MESH.points)) == 0
@@ -315,9 +315,7 @@ def test_replace_looks_at_the_integers_first():
 def test_traced_integers_end_in_a_status(engine):
     """Under a user's jit nothing can be raised: whatever the integers are, rays end, and all say
     so, in range or not."""
-    draw = jax.jit(
-        lambda m: jaxvr.render(m, CAMERA, TRANSFER, adjoint=ENGINES[engine], status=True)
-    )
+    draw = jax.jit(lambda m: jaxvr.render(m, CAMERA, TRANSFER, engine=ENGINES[engine], status=True))
     assert not np.asarray(draw(MESH)[1]).any()
     order = np.random.default_rng(0).permutation(MESH.n_tets)
     permuted = [(n, changed(**{n: getattr(MESH, n)[order]})) for n in ("cells", "neighbors")]
@@ -333,7 +331,7 @@ def test_a_picture_of_broken_integers_is_nan_where_no_status_is_asked_for():
 
     def loss(values, mesh):
         mesh = dataclasses.replace(mesh, values=values)
-        image = jaxvr.render(mesh, CAMERA, TRANSFER, adjoint=ENGINES["jax"])
+        image = jaxvr.render(mesh, CAMERA, TRANSFER, engine=ENGINES["jax"])
         return image.sum(), image
 
     draw = jax.jit(jax.grad(loss, has_aux=True))
@@ -348,9 +346,7 @@ def test_rings_end(engine):
     """Each cell's neighbour across any face is the cell itself: a walk that never leaves."""
     cell = np.arange(MESH.n_tets)[:, None] << 4 | np.arange(4)[None]
     ring = changed(neighbors=jnp.asarray(cell.astype(np.int32)))
-    draw = jax.jit(
-        lambda m: jaxvr.render(m, CAMERA, TRANSFER, adjoint=ENGINES[engine], status=True)
-    )
+    draw = jax.jit(lambda m: jaxvr.render(m, CAMERA, TRANSFER, engine=ENGINES[engine], status=True))
     bits = np.asarray(draw(ring)[1])
     assert (bits & BROKEN).any()
 
@@ -365,7 +361,7 @@ def test_positions_out_of_order(engine, positions):
     segments = jaxvr.trace(MESH, CAMERA)
     with pytest.raises(ValueError, match="positions"):
         jaxvr.shade(segments, moved)
-    draw = jax.jit(lambda t: jaxvr.render(MESH, CAMERA, t, adjoint=ENGINES[engine], status=True))
+    draw = jax.jit(lambda t: jaxvr.render(MESH, CAMERA, t, engine=ENGINES[engine], status=True))
     image, bits = draw(moved)
     assert np.isfinite(image).all() and (np.asarray(bits) & UNSORTED).all()
     with pytest.raises(jaxvr.RenderError, match="ascending order"):
