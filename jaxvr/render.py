@@ -36,6 +36,7 @@ from jaxvr.arguments import (
     compositor_of,
     dtype_of,
     integrator_of,
+    is_rays,
     offset_of,
     rays_of,
     segments_of,
@@ -49,11 +50,10 @@ from jaxvr.trace import AbstractTracer, Recorded, Segments
 from jaxvr.trace.beam import are_rays
 from jaxvr.trace.integrity import unfit
 from jaxvr.trace.recorded import Nodes, fill, record
-from jaxvr.units import mesh_in, transfer_in, units_of
-from jaxvr.view.camera import Camera
+from jaxvr.units import transfer_in, units_in, units_of, volume_in
+from jaxvr.view.camera import HasRays
 from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
-from jaxvr.volume.integrity import hold, unasked
-from jaxvr.volume.mesh import TetMesh
+from jaxvr.volume import AbstractVolume
 
 Array = jax.Array
 
@@ -69,8 +69,8 @@ _PARTS = 20
 
 @overload
 def render(
-    volume: TetMesh,
-    camera: Camera,
+    volume: AbstractVolume,
+    camera: HasRays,
     transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
@@ -85,8 +85,8 @@ def render(
 
 @overload
 def render(
-    volume: TetMesh,
-    camera: Camera,
+    volume: AbstractVolume,
+    camera: HasRays,
     transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
@@ -101,8 +101,8 @@ def render(
 
 @overload
 def render(
-    volume: TetMesh,
-    camera: Camera,
+    volume: AbstractVolume,
+    camera: HasRays,
     transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
@@ -116,8 +116,8 @@ def render(
 
 
 def render(
-    volume: TetMesh,
-    camera: Camera,
+    volume: AbstractVolume,
+    camera: HasRays,
     transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
@@ -131,12 +131,14 @@ def render(
     """An image of a volume.
 
     Args:
-      volume: a `TetMesh`.
-      camera: where from, and how many pixels.
+      volume: a `TetMesh`, or what derives from `jaxvr.volume.AbstractVolume`.
+      camera: where from, and how many pixels: a `Camera`, or what gives rays as one does (see
+        `jaxvr.view.HasRays`).
       transfer: colour and extinction of each scalar. May be None with a compositor that does not
         look at it, as `XRay()`.
-      tracer: `RayCast()` if None. compositor: `Over()`, or `MaximumIntensity()`, `XRay()`.
-        integrator: what the compositor has by default, `Analytic()` for light.
+      tracer: `volume.default_tracer()` if None, `RayCast()` for meshes. compositor: `Over()`, or
+        `MaximumIntensity()`, `XRay()`. integrator: what the compositor has by default, `Analytic()`
+        for light.
       adjoint: `Replay()`, for reverse mode; `Forward()` for forward mode, `Direct(...)` for both.
       background: opaque linear RGB (3,) behind the volume; None leaves it transparent.
       budget: bytes for the state of the rays that march at once, beside the volume and the image;
@@ -162,26 +164,27 @@ def render(
     `camera` (eye, target, up, fov or extent) and `background`. Notes on kinks are with `RayCast`,
     `jaxvr.optics.partition` and the adjoints.
     """
-    pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
-    camera = camera_of(camera, volume_of(volume))
+    volume = volume_of(volume)
+    pipeline = _pipeline(tracer_of(tracer, volume), integrator, compositor)
+    view = camera_of(camera, volume)
     transfer = transfer_of(transfer, volume, pipeline.compositor)
     how = _how(pipeline, adjoint, budget, volume)
     with refusing(how[1]):
-        scene = bare(volume), bare(camera), bare(transfer)
+        scene = bare(volume), bare(view), bare(transfer)
         last = offset_of(volume), background_of(background)
         image, bits, seen = _render(*how, *scene, *last)
-    bits = hold(volume, bits)
+    bits = volume.hold(bits)
     if status:
         return image, bits
     if is_concrete(bits):
         check(bits)
-        hints.look(volume, camera, transfer, seen, pipeline.compositor, stacklevel=2)
-    return unasked(volume, image, bits)
+        hints.look(volume, view, transfer, seen, pipeline.compositor, stacklevel=2)
+    return volume.unasked(image, bits)
 
 
 @overload
 def render_rays(
-    volume: TetMesh,
+    volume: AbstractVolume,
     origins: Any,
     directions: Any,
     transfer: TransferFunction | None,
@@ -198,7 +201,7 @@ def render_rays(
 
 @overload
 def render_rays(
-    volume: TetMesh,
+    volume: AbstractVolume,
     origins: Any,
     directions: Any,
     transfer: TransferFunction | None,
@@ -215,7 +218,7 @@ def render_rays(
 
 @overload
 def render_rays(
-    volume: TetMesh,
+    volume: AbstractVolume,
     origins: Any,
     directions: Any,
     transfer: TransferFunction | None,
@@ -231,7 +234,7 @@ def render_rays(
 
 
 def render_rays(
-    volume: TetMesh,
+    volume: AbstractVolume,
     origins: Any,
     directions: Any,
     transfer: TransferFunction | None,
@@ -258,25 +261,26 @@ def render_rays(
       rgba (..., 4), premultiplied linear, in the volume's dtype. Differentiable in origins and
       directions too.
     """
-    pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
-    origins, directions = rays_of(origins, directions, volume_of(volume))
+    volume = volume_of(volume)
+    pipeline = _pipeline(tracer_of(tracer, volume), integrator, compositor)
+    origins, directions = rays_of(origins, directions, volume)
     transfer = transfer_of(transfer, volume, pipeline.compositor)
     how = _how(pipeline, adjoint, budget, volume)
     with refusing(how[1]):
         scene = bare(volume), origins, directions, bare(transfer)
         last = offset_of(volume), background_of(background)
         rgba, bits = _render_rays(*how, *scene, *last)
-    bits = hold(volume, bits)
+    bits = volume.hold(bits)
     if status:
         return rgba, bits
     if is_concrete(bits):
         check(bits)
-    return unasked(volume, rgba, bits)
+    return volume.unasked(rgba, bits)
 
 
 def trace(
-    volume: TetMesh,
-    camera: Camera | tuple[Any, Any],
+    volume: AbstractVolume,
+    camera: HasRays | tuple[Any, Any],
     *,
     tracer: AbstractTracer | None = None,
     budget: int | None = None,
@@ -300,15 +304,16 @@ def trace(
             "trace cannot run inside jit or grad, since the number of segments decides the shape "
             "of its result. Call it outside and pass its result in, or use render."
         )
-    tracer, volume = tracer_of(tracer), volume_of(volume)
-    if isinstance(camera, Camera):
-        camera = camera_of(camera, volume)
-        shape, order = (camera.height, camera.width), tile_order(camera.height, camera.width)
-        origins, directions = (x.reshape(-1, 3)[order] for x in camera.local_rays())
-    else:
+    volume = volume_of(volume)
+    tracer = tracer_of(tracer, volume)
+    if is_rays(camera):
         origins, directions = rays_of(*camera, volume)
         shape, order = origins.shape[:-1], np.arange(origins.size // 3)
         origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+    else:
+        view = camera_of(camera, volume)
+        shape, order = (view.height, view.width), tile_order(view.height, view.width)
+        origins, directions = (x.reshape(-1, 3)[order] for x in view.local_rays())
     how = (tracer, compiled.covers(native, volume.dtype, tracer), _batch_size(budget, volume))
     offset, volume = volume.offset, bare(volume)
     counts, status = _count(*how, volume, origins, directions)
@@ -434,8 +439,8 @@ def _shade(pipeline, adjoint, size, segments, transfer, offset, background):
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _count(tracer, native, size, volume, origins, directions):
-    units = units_of(volume.points, volume.values)
-    volume, origins = mesh_in(units, volume), origins * units.length
+    units = units_in(volume)
+    volume, origins = volume_in(units, volume), origins * units.length
     scene = tracer.prepare(volume)
     rays, count = batches(size, (origins, directions))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(*rays)
@@ -446,8 +451,8 @@ def _count(tracer, native, size, volume, origins, directions):
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 7))
 def _fill(tracer, native, size, volume, origins, directions, start, total):
-    units = units_of(volume.points, volume.values)
-    volume, origins = mesh_in(units, volume), origins * units.length
+    units = units_in(volume)
+    volume, origins = volume_in(units, volume), origins * units.length
     scene = tracer.prepare(volume)
     (origins, directions, starts), _ = batches(size, (origins, directions, start))
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(origins, directions)
@@ -460,8 +465,8 @@ def _fill(tracer, native, size, volume, origins, directions, start, total):
 
 def _run(pipeline, adjoint, size, volume, origins, directions, transfer, offset):
     """rgba (R, 4) and status (R,) of rays (R, 3)."""
-    units = units_of(volume.points, volume.values, transfer.positions)
-    volume, origins = mesh_in(units, volume), origins * units.length
+    units = units_in(volume, transfer.positions)
+    volume, origins = volume_in(units, volume), origins * units.length
     transfer = transfer_in(units, transfer)
     scene = pipeline.tracer.prepare(volume)
     rays, count = batches(size, (origins, directions))
@@ -469,25 +474,14 @@ def _run(pipeline, adjoint, size, volume, origins, directions, transfer, offset)
     scale = Scale(units.scalar, units.length, offset)
     rgba, status = _finish(pipeline, adjoint, scene, rays, transfer, scale, count)
     status = jnp.where(are_rays(origins.T, directions.T), status, status | LOST)
-    good = _in_range(volume, getattr(adjoint, "native", False))
+    good = volume.in_range(bool(getattr(adjoint, "native", False)))
     return rgba, jnp.where(good, status, BROKEN) | units.status
 
 
-def _in_range(volume: Any, compiled_loops: Any) -> Array:
-    """Whether integers () of a mesh name points and cells that it has. Compiled loops look at those
-    of cells themselves, as they load them."""
-    count = volume.cells.shape[0]
-    good = jnp.all((volume.boundary >= 0) & (volume.boundary >> 4 < count))
-    if compiled_loops:
-        return good
-    cells, words = volume.cells, volume.neighbors
-    good = good & jnp.all((cells >= 0) & (cells < volume.points.shape[0]))
-    return good & jnp.all((words >= -1) & (words >> 4 < count))
-
-
 def _finish(pipeline, adjoint, scene, rays, transfer, scale, count):
-    longest = lax.stop_gradient(pipeline.tracer.longest(scene))
-    table = pipeline.integrator.prepare(transfer, longest.dtype, longest)
+    longest = pipeline.tracer.longest(scene)
+    longest = None if longest is None else lax.stop_gradient(longest)
+    table = pipeline.integrator.prepare(transfer, transfer.positions.dtype, longest)
     state, status = adjoint.run(pipeline, Operands(scene, rays, table))
     compositor = pipeline.compositor
     shown = transfer if "transfer" in compositor.needs else None

@@ -50,6 +50,7 @@ from jaxvr.adjoint.base import (
     run_batches,
     shade_piece,
 )
+from jaxvr.adjoint.by_rows import reverse_of
 
 Array = jax.Array
 
@@ -144,9 +145,10 @@ def _forward(pipeline: Pipeline, compiled: bool, primals: Any):
 def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: Any):
     operands, finals, asked = residuals
     state_bar = jax.tree.map(_cotangent, finals, cotangents[0])
-    tracer, integrator = pipeline.tracer, pipeline.integrator
+    integrator = pipeline.integrator
     structure = jax.tree.structure(operands)
     perturbed: Operands = jax.tree.unflatten(structure, [flag.shape[0] == 1 for flag in asked])
+    tracer = reverse_of(pipeline.tracer, _is_geometric(perturbed))
     optical = pipeline.compositor.shades and any(jax.tree.leaves(perturbed.table))
     # Where it is transparent, segments have no gradient, but the transfer function has.
     table = operands.table if optical else integrator.shorten(operands.table, False)
@@ -176,6 +178,10 @@ def _backward(pipeline: Pipeline, compiled: bool, residuals: Any, cotangents: An
     )
 
 
+def _is_geometric(perturbed: Operands) -> bool:
+    return any(jax.tree.leaves((perturbed.scene, perturbed.rays)))
+
+
 def _walk_again(
     pipeline: Pipeline,
     operands: Operands,
@@ -185,8 +191,9 @@ def _walk_again(
     optical: bool,
 ) -> tuple[Any, list[Array], Any]:
     """Gradients of the scene and the table as they are accumulated, and cotangents of the rays."""
-    tracer, integrator, compositor = pipeline.tracer, pipeline.integrator, pipeline.compositor
-    geometric = any(jax.tree.leaves((perturbed.scene, perturbed.rays)))
+    integrator, compositor = pipeline.integrator, pipeline.compositor
+    geometric = _is_geometric(perturbed)
+    tracer = reverse_of(pipeline.tracer, geometric)
 
     def batch(carry, inputs):
         scene_bar, table_bar = carry

@@ -46,7 +46,7 @@ from __future__ import annotations
 
 import dataclasses
 import numbers
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -102,7 +102,7 @@ from jaxvr.trace.stream import (
     start_stream,
     tolerance,
 )
-from jaxvr.volume import packing
+from jaxvr.volume import TetMesh, packing
 
 Array = jax.Array
 
@@ -175,6 +175,8 @@ class KBuffer(AbstractTracer):
     Raises:
       ValueError: if k is not a positive integer, or order or pairs are not what they may be.
     """
+
+    takes: ClassVar[type] = TetMesh
 
     k: int = 6
     order: AbstractOrder = Centroid()

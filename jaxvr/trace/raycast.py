@@ -34,7 +34,7 @@ inverted cells in 28,800) that is one ray in 700.
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -149,6 +149,8 @@ class RayCast(AbstractTracer):
     on rays that only touch an edge or a vertex of the boundary. Zero by convention where a ray lies
     in a face's plane.
     """
+
+    takes: ClassVar[type] = TetMesh
 
     def reversed(self):
         raise ValueError(
