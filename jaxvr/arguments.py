@@ -200,6 +200,7 @@ def tracer_of(tracer: Any, volume: Any) -> AbstractTracer:
     if tracer is None:
         return RayCast() if volume is None else volume.default_tracer()
     found = _noun("tracer", tracer, "prepare_rays", RayCast)
+    _require_methods("tracer", found, ("prepare", "start", "step", "longest"), AbstractTracer)
     takes = getattr(found, "takes", AbstractVolume)
     if volume is not None and not isinstance(volume, takes):
         kind = type(volume).__name__
@@ -235,13 +236,18 @@ def compositor_of(compositor: Any) -> AbstractCompositor:
         "add",
         "done",
     )
+    _require_methods("compositor", found, names, AbstractCompositor)
+    return found
+
+
+def _require_methods(noun: str, found: Any, names: tuple[str, ...], base: type) -> None:
     missing = [name for name in names if not hasattr(found, name)]
     if missing:
+        room = "composite" if noun == "compositor" else "trace"
         raise ValueError(
-            f"compositor is a {type(found).__name__}, which has no {', '.join(missing)}: derive it "
-            "from jaxvr.composite.AbstractCompositor."
+            f"{noun} is a {type(found).__name__}, which has no {', '.join(missing)}: derive it "
+            f"from jaxvr.{room}.{base.__name__}."
         )
-    return found
 
 
 def adjoint_of(adjoint: Any) -> AbstractAdjoint:

@@ -7,8 +7,8 @@ A tracer is a frozen dataclass without arrays, split in the manner of an iterati
   current segment, which rays have one (`active`), and which of those segments do not start at the
   scalar where the one before ended (`fresh`);
 - `address` and `segment` say what the current segment hangs on, and how: rows of the scene's
-  arrays, what all segments share, and the ray. The replaying adjoint needs no more than that. (Those
-  for tetrahedra have `pull_back` instead, which does the same by hand.)
+  arrays, what all segments share, and the ray. The replaying adjoint needs no more than that.
+  (Those for tetrahedra have `pull_back` instead, which does the same by hand.)
 - `reversed` is the tracer of the same segments from behind, where there is one.
 
 Integers are found without derivatives; floats are derived from what they gather. A new tracer is
