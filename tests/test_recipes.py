@@ -358,6 +358,7 @@ def test_refusals_in_words():
     grid, mesh = grid_of("float32"), registry.mesh_of("point", "float32")
     camera, transfer = camera_of(grid), transfer_of("float32")
     word: Any = "front"
+    none: Any = None
 
     def refused(match, volume=grid, view: Any = camera, **nouns):
         for verb in (
@@ -384,7 +385,7 @@ def test_refusals_in_words():
     refused("camera must be a jaxvr.Camera, but is a str.*rays", view=word)
     refused("camera must be .* but is <class.*Given", view=Given)
     rays = camera.rays()
-    refused(r"Given.height and Given.width must be .* 5 and None", view=Given(*rays, width=None))
+    refused(r"Given.height and Given.width must be .* 5 and None", view=Given(*rays, width=none))
     refused(r"rays of shape \(5, 6\), but Given is 4 x 6", view=Given(*rays, height=4))
     refused(r"origins must have shape \(\.\.\., 3\)", view=Given(rays[0][..., :2], rays[1]))
     refused("directions has 90 NaN", view=Given(rays[0], rays[1] * np.nan))
