@@ -5,14 +5,14 @@ were made of, and `segment`, how they were made of them. The rest is alike for a
 `jax.vjp` of `segment`, and add the cotangents to where the rows came from. What found the segment,
 the state, is held.
 
-A tracer may do all of that by hand instead, by four methods (`Reverse`): those of tetrahedra do,
-for speed.
+A tracer may do all of that by hand instead, by four methods from `gradient_start` to
+`rays_cotangent`: those of tetrahedra do, for speed.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,30 +24,7 @@ from jaxvr.trace.base import AbstractTracer, Store, gather
 Array = jax.Array
 
 
-class Reverse(Protocol):
-    """How cotangents of segments get to the floats of a scene and of rays."""
-
-    def gradient_start(self, scene: Any, rays: Any, perturbed: tuple[Any, Any]) -> tuple[Any, Any]:
-        """Zeros to accumulate in, for the scene and for a batch of rays. `perturbed` has the
-        structure of (scene, rays), with True at leaves whose gradients are asked for."""
-        ...
-
-    def pull_back(
-        self, scene: Any, rays: Any, state: Any, cotangent: Segment, gradient: tuple[Any, Any]
-    ) -> tuple[Any, Any]:
-        """`gradient` with the share of the current segments added."""
-        ...
-
-    def scene_cotangent(self, scene: Any, gradient: Any) -> Any:
-        """The accumulated gradient in the form of `scene`; integer leaves are ignored."""
-        ...
-
-    def rays_cotangent(self, rays: Any, gradient: Any) -> Any:
-        """The accumulated gradient in the form of `rays`; integer leaves are ignored."""
-        ...
-
-
-def reverse_of(tracer: Any, geometric: bool) -> Reverse:
+def reverse_of(tracer: Any, geometric: bool) -> Any:
     """A tracer's own way, that by rows, or none.
 
     geometric: whether derivatives by the scene or the rays are asked for at all.
@@ -55,7 +32,7 @@ def reverse_of(tracer: Any, geometric: bool) -> Reverse:
     Raises:
       ValueError: if they are, and the tracer has no way: a gradient of 0 would be no one's notice.
     """
-    if hasattr(tracer, "pull_back"):
+    if _has(tracer, "pull_back"):
         return tracer
     missing = [name for name in ("address", "segment") if not _has(tracer, name)]
     if geometric and missing:
@@ -76,8 +53,8 @@ def _has(tracer: Any, name: str) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class ByRows:
-    """`Reverse` of a tracer with `address` and `segment`. Gradients are lists of the float leaves
-    of (rows, whole), and of the rays, in order; None at those that nobody asks for."""
+    """The way back of a tracer with `address` and `segment`. Gradients are lists of the float
+    leaves of (rows, whole), and of the rays, in order; None at those that nobody asks for."""
 
     tracer: Any
 

@@ -155,6 +155,30 @@ class AbstractTracer(abc.ABC):
             "lengths of its segments, but not where they are, and so it cannot be probed."
         )
 
+    # By hand, in place of `address` and `segment`. Where neither is written, adjoints say so.
+
+    def gradient_start(self, scene: Any, rays: Any, perturbed: tuple[Any, Any]) -> tuple[Any, Any]:
+        """Zeros to accumulate in, for the scene and for a batch of rays. `perturbed` has the
+        structure of (scene, rays), with True at leaves whose gradients are asked for."""
+        raise self._no_way("gradient_start")
+
+    def pull_back(
+        self, scene: Any, rays: Any, state: Any, cotangent: Segment, gradient: tuple[Any, Any]
+    ) -> tuple[Any, Any]:
+        """`gradient` with the share of the current segments added."""
+        raise self._no_way("pull_back")
+
+    def scene_cotangent(self, scene: Any, gradient: Any) -> Any:
+        """The accumulated gradient in the form of `scene`; integer leaves are ignored."""
+        raise self._no_way("scene_cotangent")
+
+    def rays_cotangent(self, rays: Any, gradient: Any) -> Any:
+        """The accumulated gradient in the form of `rays`; integer leaves are ignored."""
+        raise self._no_way("rays_cotangent")
+
+    def _no_way(self, name: str) -> ValueError:
+        return ValueError(f"{type(self).__name__} has no {name}.")
+
 
 def gather(rows: Any, address: Any) -> Any:
     """Rows (C, R, ...) of arrays (N, ...) by numbers (C, R) int32, 0 where these are -1."""
