@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 import jaxvr
-from jaxvr.defaults import diagonal
+from jaxvr._core.units import norm
 
 # Centre, width and height of shells of density, as parts of the range and of the highest.
 PEAKS = (
@@ -31,6 +31,12 @@ PEAKS = (
 
 # Control points of the transfer function that is timed unless another number is asked for.
 POINTS = 11
+
+
+def diagonal(volume: Any) -> float:
+    """Length of the diagonal of a volume's box, of an older checkout's too."""
+    low, high = (np.asarray(x, np.float64) for x in volume.bounds())
+    return norm(high - low)
 
 
 def read_volume(path: Any = None, field: str | None = None) -> jaxvr.TetMesh:

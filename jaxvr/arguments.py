@@ -5,7 +5,9 @@ Each raises a `ValueError` that says what was found.
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+import math
+from typing import Any, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -29,10 +31,9 @@ from jaxvr.optics.transfer import tell_coarse
 from jaxvr.optics.unshaded import Unshaded
 from jaxvr.trace import AbstractTracer, RayCast, Segments
 from jaxvr.trace.integrity import require_segments
-from jaxvr.view.camera import Camera
+from jaxvr.view.camera import Camera, RayImage
 from jaxvr.view.rays import Rays
-from jaxvr.volume.integrity import require_mesh
-from jaxvr.volume.mesh import TetMesh
+from jaxvr.volume import AbstractVolume
 
 Array = jax.Array
 
@@ -51,18 +52,55 @@ def background_of(background: Any) -> Array | None:
 
 def dtype_of(volume: Any) -> Any:
     """Of a mesh or of segments."""
-    return volume.scalar.dtype if isinstance(volume, Segments) else volume.points.dtype
+    return volume.scalar.dtype if isinstance(volume, Segments) else volume.dtype
 
 
-def volume_of(volume: Any) -> TetMesh:
-    require_kind("volume", volume, TetMesh, "Read files with jaxvr.read_mesh.")
-    require_mesh(volume)
+def volume_of(volume: Any) -> Any:
+    """A volume, checked. One of another maker derives from `AbstractVolume`."""
+    if not isinstance(volume, AbstractVolume):
+        hint = "Read files with jaxvr.read_mesh."
+        if dataclasses.is_dataclass(volume):
+            hint = "Another kind of volume derives from jaxvr.volume.AbstractVolume."
+        what = repr(volume) if isinstance(volume, type) else f"a {type(volume).__name__}"
+        raise ValueError(f"volume must be a jaxvr.TetMesh, but is {what}. {hint}")
+    _require_place(volume)
+    volume.require()
     return volume
 
 
-def camera_of(camera: Any, volume: Any) -> Camera:
-    """The camera with eye and target relative to the volume's origin."""
-    require_kind("camera", camera, Camera)
+def _require_place(volume: AbstractVolume) -> None:
+    """What a volume is relative to is compared and subtracted outside of all tracing."""
+    origin, offset, kind = volume.origin, volume.offset, type(volume).__name__
+    if not (isinstance(origin, tuple) and len(origin) == 3 and all(map(_is_plain, origin))):
+        raise ValueError(
+            f"{kind}.origin must be three plain numbers, a static field: it is what a volume's "
+            f"lengths are relative to. But it is {origin!r}; name an array otherwise."
+        )
+    if not _is_plain(offset):
+        raise ValueError(
+            f"{kind}.offset must be a plain number, a static field: it is what a volume's scalars "
+            f"are relative to. But it is {offset!r}; name an array otherwise."
+        )
+
+
+def _is_plain(x: Any) -> bool:
+    return isinstance(x, int | float) and math.isfinite(x)
+
+
+def is_camera(x: Any) -> bool:
+    """Whether it gives rays, as a camera does."""
+    return callable(getattr(x, "rays", None)) and not isinstance(x, type)
+
+
+def is_rays(x: Any) -> TypeGuard[tuple[Any, Any]]:
+    """Whether it is (origins, directions), and no camera."""
+    return isinstance(x, tuple | list) and not is_camera(x)
+
+
+def camera_of(camera: Any, volume: Any) -> Camera | RayImage:
+    """The camera relative to the volume's origin: what has `local_rays()`, `height`, `width`."""
+    if not isinstance(camera, Camera):
+        return _image_of(camera, volume)
     for name in ("eye", "target", "up", "fov", "extent"):
         part = getattr(camera, name)
         if part is not None:
@@ -71,6 +109,36 @@ def camera_of(camera: Any, volume: Any) -> Camera:
     if camera.origin != volume.origin:
         _require_digits(camera, volume.origin)
     return camera.relative_to(volume.origin, dtype)
+
+
+def _image_of(camera: Any, volume: Any) -> RayImage:
+    """The rays of a camera of another maker, who gives them in the world."""
+    if not is_camera(camera):
+        what = repr(camera) if isinstance(camera, type) else f"a {type(camera).__name__}"
+        raise ValueError(
+            f"camera must be a jaxvr.Camera, but is {what}. A camera of your own has width, "
+            "height, and rays() that gives origins and directions (height, width, 3)."
+        )
+    kind = type(camera).__name__
+    shape = tuple(getattr(camera, name, None) for name in ("height", "width"))
+    if not all(isinstance(n, int | np.integer) and n > 0 for n in shape):
+        raise ValueError(
+            f"{kind}.height and {kind}.width must be whole numbers of pixels, but are {shape[0]!r} "
+            f"and {shape[1]!r}."
+        )
+    rays = camera.rays()
+    if not (isinstance(rays, tuple | list) and len(rays) == 2):
+        raise ValueError(
+            f"{kind}.rays() must give two arrays, origins and directions, but gives "
+            f"a {type(rays).__name__}."
+        )
+    world = rays_of(rays[0], rays[1], volume)
+    if world.origins.shape != (*shape, 3):
+        raise ValueError(
+            f"{kind}.rays() gives rays of shape {world.origins.shape[:-1]}, but {kind} is "
+            f"{shape[0]} x {shape[1]} pixels high and wide."
+        )
+    return RayImage(world.origins, world.directions)
 
 
 def _require_digits(camera: Camera, origin: Origin) -> None:
@@ -131,8 +199,31 @@ def segments_of(segments: Any) -> Segments:
     return segments
 
 
-def tracer_of(tracer: Any) -> AbstractTracer:
-    return _noun("tracer", tracer, "prepare_rays", RayCast)
+def tracer_of(tracer: Any, volume: Any) -> AbstractTracer:
+    """A tracer for a volume, its default one if that is None. volume: checked; None if there is
+    none, but segments that were traced."""
+    if tracer is None:
+        return RayCast() if volume is None else volume.default_tracer()
+    found = _noun("tracer", tracer, "prepare_rays", RayCast)
+    _require_methods("tracer", found, ("prepare", "start", "step", "longest"), AbstractTracer)
+    takes = getattr(found, "takes", AbstractVolume)
+    if volume is not None and not isinstance(volume, takes):
+        kind = type(volume).__name__
+        raise ValueError(
+            f"{type(found).__name__} traces a {takes.__name__}, and volume is a {kind}: leave "
+            f"tracer out, which takes {volume.default_tracer()!r}."
+        )
+    return found
+
+
+def require_cuts(tracer: Any, near: Any, far: Any) -> None:
+    """ValueError for ends of rays that a tracer would not look at."""
+    given = [name for name, x in (("near", near), ("far", far)) if x is not None]
+    if given and not getattr(tracer, "cuts", False):
+        raise ValueError(
+            f"{type(tracer).__name__} does not cut segments at {' and '.join(given)}. If it does, "
+            "its class says cuts = True (see jaxvr.trace.AbstractTracer)."
+        )
 
 
 def integrator_of(
@@ -160,13 +251,18 @@ def compositor_of(compositor: Any) -> AbstractCompositor:
         "add",
         "done",
     )
+    _require_methods("compositor", found, names, AbstractCompositor)
+    return found
+
+
+def _require_methods(noun: str, found: Any, names: tuple[str, ...], base: type) -> None:
     missing = [name for name in names if not hasattr(found, name)]
     if missing:
+        room = "composite" if noun == "compositor" else "trace"
         raise ValueError(
-            f"compositor is a {type(found).__name__}, which has no {', '.join(missing)}: derive it "
-            "from jaxvr.composite.AbstractCompositor."
+            f"{noun} is a {type(found).__name__}, which has no {', '.join(missing)}: derive it "
+            f"from jaxvr.{room}.{base.__name__}."
         )
-    return found
 
 
 def adjoint_of(adjoint: Any) -> AbstractAdjoint:

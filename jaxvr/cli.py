@@ -19,7 +19,7 @@ from jaxvr._core.offsets import absolute
 from jaxvr._core.status import RenderError
 from jaxvr._core.warn import warn
 from jaxvr._core.writing import place_of
-from jaxvr.defaults import DEPTH, UPS, best_up, default_transfer, diagonal
+from jaxvr.defaults import DEPTH, UPS, best_up, default_transfer
 from jaxvr.files import image_writer, save_image
 from jaxvr.fit import CheckpointWarning, FitError, fit, noise
 from jaxvr.fit.resume import prepare
@@ -28,7 +28,6 @@ from jaxvr.optics import TransferFunction
 from jaxvr.render import render
 from jaxvr.view import Camera
 from jaxvr.volume import TetMesh, list_fields, read_mesh, read_plot3d
-from jaxvr.volume.statistics import value_range
 
 _PLOT3D = {".xyz", ".x", ".g", ".grd", ".p3d", ".bin", ".q"}
 
@@ -80,14 +79,14 @@ def picture(arguments: Any) -> None:
     transfer = _transfer(arguments.tf, mesh, arguments)
     camera, view = _camera(mesh, transfer, arguments)
     image = np.asarray(render(mesh, camera, transfer, background=arguments.background))
-    field = mesh.report.field or "values"
+    field = mesh.field_name or "values"
     if arguments.scalar_bar:
         from jaxvr import plot
 
         plot.image(image, transfer=transfer, label=field).savefig(out)
     else:
         save_image(out, image)
-    low, high = value_range(mesh)
+    low, high = mesh.value_range()
     ends = transfer.absolute_positions()[[0, -1]]
     size = f"{image.shape[1]} x {image.shape[0]}, mean alpha {image[..., 3].mean():.3f}"
     print(f"{out}  {size}")
@@ -223,7 +222,7 @@ def _is_plot3d(arguments: Any) -> bool:
 
 def _typical(transfer: TransferFunction, mesh: TetMesh) -> float:
     mean = float(np.asarray(transfer.extinctions, np.float64).mean())
-    return mean if mean > 0 else DEPTH / diagonal(mesh)
+    return mean if mean > 0 else DEPTH / mesh.diagonal()
 
 
 def _transfer(source: str, mesh: TetMesh, arguments: Any) -> TransferFunction:

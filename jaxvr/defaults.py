@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxvr._core.units import norm
 from jaxvr.arguments import volume_of
 from jaxvr.optics import TransferFunction
 from jaxvr.view.camera import Camera
-from jaxvr.volume import TetMesh, statistics
-from jaxvr.volume.geometry import signed_volumes
+from jaxvr.volume import AbstractVolume, statistics
 
 # Optical depth along the diagonal of the volume's box where the extinction is largest: the cells of
 # the highest values hide each other, and those of the lowest can be looked through.
@@ -23,14 +21,8 @@ NOISE = 1e-6
 UPS = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0), "x": (1.0, 0.0, 0.0)}
 
 
-def diagonal(volume: TetMesh) -> float:
-    """Length of the diagonal of the volume's box, in world units."""
-    lo, hi = (np.asarray(x, np.float64) for x in volume.bounds())
-    return norm(hi - lo)
-
-
 def default_transfer(
-    volume: TetMesh,
+    volume: AbstractVolume,
     colormap: Any = "viridis",
     *,
     depth: float = DEPTH,
@@ -55,7 +47,7 @@ def default_transfer(
       a transfer function in the volume's dtype. Of a constant field: one point.
 
     Raises:
-      ValueError: for what is no `TetMesh`, for a depth below 0, and for quantiles that do not rise
+      ValueError: for what is no volume, for a depth below 0, and for quantiles that do not rise
         between 0 and 1.
     """
     if not 0 <= depth < np.inf:
@@ -66,20 +58,20 @@ def default_transfer(
         )
     volume = volume_of(volume)
     low, high = statistics.quantiles(volume, quantiles)
-    least, most = statistics.value_range(volume)
+    least, most = volume.value_range()
     if not high - low > NOISE * (most - least):
         low, high = least, most
     # Where few numbers lie between the two, there are fewer points.
     positions = np.linspace(low, high, points) - volume.offset
     positions = np.unique(positions.astype(volume.dtype))
     ramp = np.linspace(0, 1, len(positions)) if len(positions) > 1 else np.ones(1)
-    extinctions = (depth / diagonal(volume) * ramp).astype(volume.dtype)
+    extinctions = (depth / volume.diagonal() * ramp).astype(volume.dtype)
     return TransferFunction.from_colormap(
         colormap, positions, extinctions, offset=volume.offset, dtype=volume.dtype
     )
 
 
-def best_up(volume: TetMesh, transfer: TransferFunction, **view: Any) -> str:
+def best_up(volume: AbstractVolume, transfer: TransferFunction, **view: Any) -> str:
     """Which of the axes "y", "z" and "x", turned upwards, shows most of a volume.
 
     view: azimuth and elevation in degrees, fov and zoom, as for `Camera.orbit`, whose view it is.
@@ -87,29 +79,26 @@ def best_up(volume: TetMesh, transfer: TransferFunction, **view: Any) -> str:
     What a view shows is how much its picture varies: the variance of premultiplied colours and
     alpha over the pixels. Pictures are rough ones that compile nothing: each cell is a dot with its
     volume's optical depth, up to 32 x 32 pixels, fewer where there are few cells. An axis must
-    show a twentieth more than those before it in that order.
+    show a twentieth more than those before it in that order. Of a volume that has no list of its
+    parts (`AbstractVolume.dots`), "y".
     """
-    cells = np.asarray(volume.cells)
-    points = np.asarray(volume.points, np.float64)
-    size = np.abs(signed_volumes(points, cells)[0]) / 6
-    points = points[cells]
-    values = volume.absolute_values()
-    if volume.location == "point":
-        values = values[cells]
-    values = values if values.ndim == 1 else values.mean(axis=1)
+    dots = volume.dots()
+    if dots is None:
+        return "y"
+    middles, size, values = dots
     x = transfer.absolute_positions()
     columns = [*np.asarray(transfer.colors, np.float64).T, np.asarray(transfer.extinctions)]
     numbers = np.stack([np.interp(values, x, np.asarray(c, np.float64)) for c in columns], axis=1)
-    n = int(np.clip(np.cbrt(len(points)), 4, 32))
+    n = int(np.clip(np.cbrt(len(middles)), 4, 32))
     best, most = "y", 0.0
     for name in ("y", "z", "x"):
-        shown = _variety(points.mean(axis=1), size, numbers, n, _orbit(volume, name, n, view))
+        shown = _variety(middles, size, numbers, n, _orbit(volume, name, n, view))
         if shown > 1.05 * most:
             best, most = name, shown
     return best
 
 
-def _orbit(volume: TetMesh, name: str, n: int, view: dict[str, Any]) -> Camera:
+def _orbit(volume: AbstractVolume, name: str, n: int, view: dict[str, Any]) -> Camera:
     return Camera.orbit(volume, up=UPS[name], width=n, height=n, **view)
 
 

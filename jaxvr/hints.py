@@ -22,11 +22,11 @@ import numpy as np
 from ._core.brief import spanned
 from ._core.checks import is_concrete
 from ._core.units import near_one, norm
+from .arguments import camera_of, is_camera
 from .composite import AbstractCompositor
 from .optics import TransferFunction
-from .view.camera import Camera
-from .volume.mesh import TetMesh
-from .volume.statistics import used_points, value_range, weighted_values
+from .view.camera import Camera, RayImage
+from .volume import AbstractVolume
 
 Array = jax.Array
 
@@ -57,26 +57,27 @@ class ViewWarning(UserWarning):
 
 
 def look(
-    volume: TetMesh,
-    camera: Camera,
+    volume: AbstractVolume,
+    camera: Camera | RayImage,
     transfer: TransferFunction,
     seen: Any,
     compositor: AbstractCompositor,
     stacklevel: int,
 ) -> None:
-    """Warn of what is odd about a picture. All operands have the dtype of the volume.
+    """Warn of what is odd about a picture. All operands have the dtype of the volume. camera: of
+    another maker's only the rays are known, and what these tell is told.
 
     seen (): the largest alpha of the picture, before its background. compositor: of one that does
     not see light, only its view and, where it sees the transfer function, ranges are looked at.
     stacklevel: as for `warnings.warn`, counted from the caller: 1 is the line that calls this.
     """
-    floats = (volume.values, volume.points, camera.eye, camera.target)
-    floats = (*floats, transfer.positions, transfer.extinctions)
-    others = (camera.up, camera.fov, camera.extent, transfer.colors, volume.cells)
-    if not is_concrete(seen, *floats, *others):
+    if not is_concrete(seen, *jax.tree.leaves((volume, camera, transfer))):
         return
-    corners = volume.cells if volume.location == "point" else None
-    glance = np.asarray(_glance(camera.extent is not None, seen, corners, *floats))
+    parallel = isinstance(camera, Camera) and camera.extent is not None
+    corners, *floats = volume.glance()
+    ends = _ends_of(camera)
+    floats = (*floats, *ends, transfer.positions, transfer.extinctions)
+    glance = np.asarray(_glance(parallel, seen, corners, *floats))
     alpha, low, high, first, last, top, diagonal, cut = (float(x) for x in glance)
     low, high, first, last = (x + volume.offset for x in (low, high, first, last))
     light = compositor.shades
@@ -85,11 +86,11 @@ def look(
     dense = (
         "rgb" in compositor.needs  # of optical depths alone nothing hides another
         and top <= 1
-        and top * diagonal > max(DENSE, DENSE_CELL * volume.n_tets ** (1 / 3))
+        and top * diagonal > max(DENSE, DENSE_CELL * volume.parts ** (1 / 3))
     )
     if not (alpha < FAINT or odd or dense or cut):
         return
-    low, high = value_range(volume)
+    low, high = volume.value_range()
     odd = odd and _odd((low, high), (first, last))
     if light and not np.asarray(transfer.extinctions).any():
         return  # nothing is to be seen, and nothing is
@@ -97,7 +98,7 @@ def look(
         if light:
             message = _faint(volume, camera, transfer, alpha, (low, high))
         else:
-            reason = _out_of_view(_used(volume), camera)
+            reason = _out_of_view(volume, camera)
             message = reason and f"The picture is blank. {reason}"
         if message:
             warnings.warn(message, ViewWarning, stacklevel=stacklevel + 1)
@@ -112,11 +113,11 @@ def look(
 
 
 def look_before_fit(
-    volume: TetMesh, cameras: Sequence[Any], transfer: TransferFunction, stacklevel: int
+    volume: AbstractVolume, cameras: Sequence[Any], transfer: TransferFunction, stacklevel: int
 ) -> None:
-    """Warn of cameras that do not see the volume (others than `Camera`s are passed over), and of a
-    start whose control points miss the field. stacklevel: as for `look`."""
-    views = {k: c for k, c in enumerate(cameras) if isinstance(c, Camera)}
+    """Warn of cameras that do not see the volume (segments are passed over), and of a start whose
+    control points miss the field. stacklevel: as for `look`."""
+    views = {k: c for k, c in enumerate(cameras) if is_camera(c)}
     if not is_concrete(*jax.tree.leaves((volume, list(views.values()), transfer))):
         return
     messages = [_unseen(volume, views), _unfit(volume, transfer)]
@@ -124,11 +125,10 @@ def look_before_fit(
         warnings.warn(message, ViewWarning, stacklevel=stacklevel + 1)
 
 
-def _unseen(volume: TetMesh, views: dict[int, Camera]) -> str | None:
+def _unseen(volume: AbstractVolume, views: dict[int, Any]) -> str | None:
     """Which cameras do not see the volume, and why the first of them does not."""
-    points = _used(volume)
-    here = {k: camera.relative_to(volume.origin) for k, camera in views.items()}
-    reasons = {k: _out_of_view(points, camera) for k, camera in here.items()}
+    here = {k: _beside(camera, volume) for k, camera in views.items()}
+    reasons = {k: _out_of_view(volume, camera) for k, camera in here.items()}
     blind = [k for k, reason in reasons.items() if reason]
     if not blind:
         return None
@@ -138,13 +138,20 @@ def _unseen(volume: TetMesh, views: dict[int, Camera]) -> str | None:
     )
 
 
-def _unfit(volume: TetMesh, transfer: TransferFunction) -> str | None:
+def _beside(camera: Any, volume: AbstractVolume) -> Camera | RayImage:
+    """In digits of its own, where it can be."""
+    if isinstance(camera, Camera):
+        return camera.relative_to(volume.origin)
+    return camera_of(camera, volume)
+
+
+def _unfit(volume: AbstractVolume, transfer: TransferFunction) -> str | None:
     """How the control points of a start miss the field. What they hold changes: a ramp over them
     stands for what they can hold."""
     ramp = np.linspace(1, 2, len(transfer.positions))
     colors = np.stack([ramp - 1] * 3, axis=1)
     ramp = TransferFunction(transfer.positions, colors, ramp, offset=transfer.offset)
-    field = value_range(volume)
+    field = volume.value_range()
     return _ranges(volume, ramp, field) if _odd(field, _ends(ramp)) else None
 
 
@@ -153,6 +160,14 @@ def _odd(field: tuple[float, float], ends: tuple[float, float]) -> bool:
     (low, high), (first, last) = field, ends
     wide = high - low, last - first
     return high < first or low > last or min(wide) < NARROW * max(wide)
+
+
+def _ends_of(camera: Camera | RayImage) -> tuple[Array, Array]:
+    """A point that a picture is taken from, and one that it looks at; of rays, of the first."""
+    if isinstance(camera, Camera):
+        return camera.eye, camera.target
+    first = camera.origins[0, 0]
+    return first, first + camera.directions[0, 0]
 
 
 @partial(jax.jit, static_argnums=0)
@@ -184,18 +199,17 @@ def _glance(parallel, seen, corners, values, points, eye, target, positions, ext
 
 
 def _faint(
-    volume: TetMesh,
-    camera: Camera,
+    volume: AbstractVolume,
+    camera: Camera | RayImage,
     transfer: TransferFunction,
     alpha: float,
     field: tuple[float, float],
 ) -> str | None:
     """Why next to nothing is seen; None where nothing is odd."""
     blank = alpha < BLANK
-    points = _used(volume)
     what = "The picture is blank" if blank else f"The picture is faint (largest alpha {alpha:.2g})"
     if blank:
-        reason = _out_of_view(points, camera) or _ranges(volume, transfer, field)
+        reason = _out_of_view(volume, camera) or _ranges(volume, transfer, field)
         if reason:
             return f"{what}. {reason}"
     strongest = float(_shown(volume, transfer, field)[:, 3].max())
@@ -206,7 +220,7 @@ def _faint(
             f"has no extinction where the field lies, from {_range(*field)}. Move its positions or "
             "raise its extinctions there."
         )
-    diagonal = norm(points.max(axis=0) - points.min(axis=0))
+    diagonal = _diagonal(volume)
     depth = strongest * diagonal
     if depth < THIN or (blank and alpha > 0):
         found = -np.log1p(-alpha) if alpha > 0 else depth
@@ -220,8 +234,12 @@ def _faint(
     return None
 
 
-def _out_of_view(points: np.ndarray, camera: Camera) -> str | None:
-    """What keeps all points (P, 3) out of the picture: behind the camera, or beyond one side."""
+def _out_of_view(volume: AbstractVolume, camera: Camera | RayImage) -> str | None:
+    """What keeps all of the volume out of the picture: behind the camera, or beyond one side. Of
+    rays, that none meets its box."""
+    points = volume.hull()
+    if isinstance(camera, RayImage):
+        return _beside_box(volume, points, camera)
     eye, target, up = (np.asarray(v, np.float64) for v in (camera.eye, camera.target, camera.up))
     forward = _unit(target - eye)
     right = _unit(np.cross(forward, up))
@@ -269,7 +287,31 @@ def _out_of_view(points: np.ndarray, camera: Camera) -> str | None:
     return None
 
 
-def _ranges(volume: TetMesh, transfer: TransferFunction, field: tuple[float, float]) -> str | None:
+def _beside_box(volume: AbstractVolume, points: np.ndarray, rays: RayImage) -> str | None:
+    """Whether all rays pass the box of the points, or start behind it."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    start, along = (np.asarray(x, np.float64).reshape(-1, 3) for x in rays.local_rays())
+    slack = 1e-6 * np.abs(np.stack([low, high, *start[:1]])).max()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, other = (low - slack - start) / along, (high + slack - start) / along
+    # Beside a side that it is parallel to, a ray is within it always or never.
+    within = (low - slack <= start) & (start <= high + slack)
+    flat = along == 0
+    enter = np.where(flat, np.where(within, -np.inf, np.inf), np.fmin(one, other)).max(axis=1)
+    leave = np.where(flat, np.inf, np.fmax(one, other)).min(axis=1)
+    if ((enter <= leave) & (leave >= 0)).any():
+        return None
+    ends = (_vector(x + np.asarray(volume.origin)) for x in (low, high))
+    return (
+        f"None of the camera's rays meets the volume, whose box reaches from {' to '.join(ends)}. "
+        f"The first ray starts at {_vector(start[0] + np.asarray(volume.origin))} and goes along "
+        f"{_vector(along[0])}."
+    )
+
+
+def _ranges(
+    volume: AbstractVolume, transfer: TransferFunction, field: tuple[float, float]
+) -> str | None:
     """How the ranges of field and transfer function miss each other; None where they fit."""
     low, high = field
     first, last = _ends(transfer)
@@ -296,7 +338,7 @@ def _ranges(volume: TetMesh, transfer: TransferFunction, field: tuple[float, flo
         part = 100 * (high - low) / (last - first)
         return f"{ranges}, of which the field takes {part:.2g} %: it is of one colour. {advice}"
     if 0 < last - first < NARROW * (high - low):
-        values, weights = weighted_values(volume)
+        values, weights = volume.weighted_values()
         between = float(weights[(values > first) & (values < last)].sum())
         beyond = float(weights[values < first].sum()), float(weights[values > last].sum())
         # Clear where values lie beyond it, it is a threshold or a peak, narrow on purpose.
@@ -309,13 +351,14 @@ def _ranges(volume: TetMesh, transfer: TransferFunction, field: tuple[float, flo
     return None
 
 
-def _dense(volume: TetMesh, transfer: TransferFunction, field: tuple[float, float]) -> str | None:
+def _dense(
+    volume: AbstractVolume, transfer: TransferFunction, field: tuple[float, float]
+) -> str | None:
     """That opacities may stand for extinctions: what would let light through hides all behind it
     within one cell."""
-    points = _used(volume)
-    diagonal = norm(points.max(axis=0) - points.min(axis=0))
+    diagonal = _diagonal(volume)
     shown = _shown(volume, transfer, field)[:, 3]
-    strongest, cell = shown[shown < 1].max(initial=0.0), diagonal / volume.n_tets ** (1 / 3)
+    strongest, cell = shown[shown < 1].max(initial=0.0), diagonal / volume.parts ** (1 / 3)
     if strongest * cell < DENSE_CELL or strongest * diagonal < DENSE:
         return None
     return (
@@ -327,15 +370,19 @@ def _dense(volume: TetMesh, transfer: TransferFunction, field: tuple[float, floa
     )
 
 
-def _inside(volume: TetMesh, camera: Camera) -> str | None:
+def _inside(volume: AbstractVolume, camera: Camera | RayImage) -> str | None:
     """That the camera stands in the volume, and what is not seen then. Without the eye's numbers,
     so that a flight through a volume is warned of once: Python tells equal warnings once."""
     low, high = (np.asarray(x, np.float64) for x in volume.bounds())
-    eye, target = (np.asarray(x, np.float64) for x in (camera.eye, camera.target))
+    eye, target = (np.asarray(x, np.float64) for x in _ends_of(camera))
     ends = (_vector(x + np.asarray(volume.origin)) for x in (low, high))
     box = f"the volume's box, from {' to '.join(ends)}"
+    inside = ((low < eye) & (eye < high)).all()
+    if isinstance(camera, RayImage):
+        what = f"The camera's first ray starts inside {box}: what is behind it is not seen."
+        return what if inside else None
     if camera.extent is None:
-        if not ((low < eye) & (eye < high)).all():
+        if not inside:
             return None  # only points that no cell uses lie around it
         what = f"The camera's eye lies inside {box}: what is behind it is not seen."
     else:
@@ -349,9 +396,10 @@ def _inside(volume: TetMesh, camera: Camera) -> str | None:
     return f"{what} Move the eye away from the target, or take Camera.orbit(volume)."
 
 
-def _used(volume: TetMesh) -> np.ndarray:
-    """The points (P, 3) that cells use, float64."""
-    return np.asarray(volume.points, np.float64)[used_points(volume)]
+def _diagonal(volume: AbstractVolume) -> float:
+    """That of the box, in float64."""
+    points = volume.hull()
+    return norm(points.max(axis=0) - points.min(axis=0))
 
 
 def _numbers(transfer: TransferFunction) -> np.ndarray:
@@ -360,15 +408,17 @@ def _numbers(transfer: TransferFunction) -> np.ndarray:
     return np.column_stack([np.asarray(transfer.colors, np.float64), extinctions])
 
 
-def _shown(volume: TetMesh, transfer: TransferFunction, field: tuple[float, float]) -> np.ndarray:
+def _shown(
+    volume: AbstractVolume, transfer: TransferFunction, field: tuple[float, float]
+) -> np.ndarray:
     """What the field can take (n, 4) of the colours and extinctions: those at its two ends and
     at the control points between them, or, where it is constant in cells, those at its values."""
     positions, numbers = transfer.absolute_positions(), _numbers(transfer)
-    cellwise = volume.location == "cell"
-    at = volume.absolute_values() if cellwise else np.array(field)
+    levels = volume.levels()
+    at = np.array(field) if levels is None else levels
     shown = np.stack([np.interp(at, positions, column) for column in numbers.T], axis=1)
     within = (positions >= field[0]) & (positions <= field[1])
-    return shown if cellwise else np.concatenate([shown, numbers[within]])
+    return shown if levels is not None else np.concatenate([shown, numbers[within]])
 
 
 def _ends(transfer: TransferFunction) -> tuple[float, float]:

@@ -24,6 +24,7 @@ from jaxvr.arguments import (
     at_the_door,
     camera_of,
     integrator_of,
+    is_rays,
     rays_of,
     tracer_of,
     transfer_of,
@@ -33,11 +34,11 @@ from jaxvr.composite import Over
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.trace import AbstractTracer
 from jaxvr.trace.recorded import record
-from jaxvr.units import Units, mesh_in, transfer_in, units_of
-from jaxvr.view.camera import Camera
+from jaxvr.units import Units, transfer_in, units_in, volume_in
+from jaxvr.view.camera import HasRays
 from jaxvr.view.rays import Rays
 from jaxvr.view.tiles import batch_size
-from jaxvr.volume.mesh import TetMesh
+from jaxvr.volume import AbstractVolume
 
 Array = jax.Array
 
@@ -47,7 +48,8 @@ class Probe:
     """What lies along R rays: S segments in all, each ray's from the eye on. NumPy arrays.
 
     start (R + 1,): the segments of ray r are number start[r] to start[r + 1] - 1.
-    cells (S,) int32: rows of `mesh.cells`, the tetrahedra that the segments lie in.
+    cells (S,) int32: rows of `mesh.cells`, the tetrahedra that the segments lie in; of another
+        volume what its tracer numbers.
     distances (S, 2): from the ray's origin to the front and the back, in world units.
     scalars (S, 2): the field at front and back; float64 where the mesh has an offset.
     contributions (S, 4): premultiplied RGBA that each adds at the eye, dimmed by what is in front.
@@ -89,8 +91,8 @@ class Probe:
 
 
 def probe(
-    volume: TetMesh,
-    camera: Camera | tuple[Any, Any],
+    volume: AbstractVolume,
+    camera: HasRays | tuple[Any, Any],
     transfer: TransferFunction,
     pixels: Any = None,
     *,
@@ -100,7 +102,7 @@ def probe(
     """What lies under pixels, or along rays.
 
     Args:
-      volume: a `TetMesh`.
+      volume: as for `render`.
       camera: a camera, or rays (origins, directions) with shapes (..., 3).
       transfer: what the contributions are those of.
       pixels: of a camera, row and column (2,) of one pixel or (R, 2) of several, row 0 on top; None
@@ -111,7 +113,8 @@ def probe(
       a `Probe`; its rays are the pixels in the order given, or the rays in C order.
 
     Raises:
-      ValueError: for pixels that are not in the picture, and for what `render` refuses.
+      ValueError: for pixels that are not in the picture, for a tracer that does not know where its
+        segments lie, and for what `render` refuses.
       RenderError: if a ray could not be followed.
 
     Not for use inside `jit` or `grad`.
@@ -119,22 +122,24 @@ def probe(
     if not is_concrete(*jax.tree.leaves((volume, camera, transfer))):
         raise ValueError("probe cannot run inside jit or grad. Call it outside.")
     volume, transfer = volume_of(volume), transfer_of(transfer, volume)
-    if isinstance(camera, Camera):
+    if is_rays(camera):
+        if pixels is not None:
+            raise ValueError(
+                "pixels belong to a camera, but rays were given. Pass only those wanted."
+            )
+        given = rays_of(*camera, volume)
+        origins, directions = np.asarray(given.origins), np.asarray(given.directions)
+    else:
         origins, directions = (np.asarray(x) for x in camera_of(camera, volume).local_rays())
         if pixels is not None:
             row, column = _pixels_of(pixels, origins.shape[:2])
             origins, directions = origins[row, column], directions[row, column]
-    elif pixels is not None:
-        raise ValueError("pixels belong to a camera, but rays were given. Pass only those wanted.")
-    else:
-        rays = rays_of(*camera, volume)
-        origins, directions = np.asarray(rays.origins), np.asarray(rays.directions)
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     # By a power of two first, so that squares neither under- nor overflow.
     largest = np.abs(directions).max(axis=1, keepdims=True, initial=0)
     directions = np.ldexp(directions, -np.frexp(largest)[1])
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    pipeline = Pipeline(tracer_of(tracer), integrator_of(integrator, Over()), Over())
+    pipeline = Pipeline(tracer_of(tracer, volume), integrator_of(integrator, Over()), Over())
     pipeline = at_the_door(pipeline, volume.dtype)
     size = min(batch_size(volume.dtype), 1 << max(len(origins) - 1, 0).bit_length())
     parts, counts, status = [], [], []
@@ -187,8 +192,8 @@ def _pixels_of(pixels: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndar
 
 @jax.jit
 def _prepare(pipeline: Pipeline, volume: Any, transfer: Any) -> tuple[Any, Any, Units]:
-    units = units_of(volume.points, volume.values, transfer.positions)
-    volume, transfer = mesh_in(units, volume), transfer_in(units, transfer)
+    units = units_in(volume, transfer.positions)
+    volume, transfer = volume_in(units, volume), transfer_in(units, transfer)
     scene = pipeline.tracer.prepare(volume)
     longest = pipeline.tracer.longest(scene)
     return scene, pipeline.integrator.prepare(transfer, volume.dtype, longest), units

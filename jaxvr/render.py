@@ -40,8 +40,10 @@ from jaxvr.arguments import (
     dtype_of,
     engine_of,
     integrator_of,
+    is_rays,
     offset_of,
     rays_of,
+    require_cuts,
     segments_of,
     tracer_of,
     transfer_of,
@@ -54,12 +56,11 @@ from jaxvr.trace import AbstractTracer, Recorded, Segments
 from jaxvr.trace.beam import are_rays
 from jaxvr.trace.integrity import unfit
 from jaxvr.trace.recorded import Nodes, Runs
-from jaxvr.units import mesh_in, rays_in, transfer_in, units_of
-from jaxvr.view.camera import Camera
+from jaxvr.units import rays_in, transfer_in, units_in, units_of, volume_in
+from jaxvr.view.camera import HasRays
 from jaxvr.view.rays import Rays, flat
 from jaxvr.view.tiles import batch_size, batches, tile, tile_order, untile
-from jaxvr.volume.integrity import hold, unasked
-from jaxvr.volume.mesh import TetMesh
+from jaxvr.volume import AbstractVolume
 
 Array = jax.Array
 
@@ -75,8 +76,8 @@ _PARTS = 20
 
 @overload
 def render(
-    volume: TetMesh,
-    camera: Camera,
+    volume: AbstractVolume,
+    camera: HasRays,
     transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
@@ -92,8 +93,8 @@ def render(
 
 @overload
 def render(
-    volume: TetMesh,
-    camera: Camera,
+    volume: AbstractVolume,
+    camera: HasRays,
     transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
@@ -109,8 +110,8 @@ def render(
 
 @overload
 def render(
-    volume: TetMesh,
-    camera: Camera,
+    volume: AbstractVolume,
+    camera: HasRays,
     transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
@@ -125,8 +126,8 @@ def render(
 
 
 def render(
-    volume: TetMesh,
-    camera: Camera,
+    volume: AbstractVolume,
+    camera: HasRays,
     transfer: TransferFunction | None,
     *,
     tracer: AbstractTracer | None = None,
@@ -141,12 +142,14 @@ def render(
     """An image of a volume.
 
     Args:
-      volume: a `TetMesh`.
-      camera: where from, and how many pixels.
+      volume: a `TetMesh`, or what derives from `jaxvr.volume.AbstractVolume`.
+      camera: where from, and how many pixels: a `Camera`, or what gives rays as one does (see
+        `jaxvr.view.HasRays`).
       transfer: colour and extinction of each scalar. May be None with a compositor that does not
         look at it, as `XRay()`.
-      tracer: `RayCast()` if None. compositor: `Over()`, or `MaximumIntensity()`, `XRay()`.
-        integrator: what the compositor has by default, `Analytic()` for light.
+      tracer: `volume.default_tracer()` if None, `RayCast()` for meshes. compositor: `Over()`, or
+        `MaximumIntensity()`, `XRay()`. integrator: what the compositor has by default, `Analytic()`
+        for light.
       adjoint: `Replay()`, for reverse mode; `Forward()` for forward mode, `Direct(...)` for both.
       engine: what runs the loops, `jaxvr.engine.C()` or `jaxvr.engine.XLA()`; None takes C where it
         does not refuse, asked at every call, or while tracing under your own `jit`.
@@ -174,26 +177,27 @@ def render(
     `camera` (eye, target, up, fov or extent) and `background`. Notes on kinks are with `RayCast`,
     `jaxvr.optics.partition` and the adjoints.
     """
-    pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
-    camera = camera_of(camera, volume_of(volume))
+    volume = volume_of(volume)
+    pipeline = _pipeline(tracer_of(tracer, volume), integrator, compositor)
+    view = camera_of(camera, volume)
     transfer = transfer_of(transfer, volume, pipeline.compositor)
     how = _how(pipeline, adjoint, engine, budget, volume)
     with refusing(how[1]):
-        scene = bare(volume), bare(camera), bare(transfer)
+        scene = bare(volume), bare(view), bare(transfer)
         last = offset_of(volume), background_of(background)
         image, bits, seen = _render(*how, *scene, *last)
-    bits = hold(volume, bits)
+    bits = volume.hold(bits)
     if status:
         return image, bits
     if is_concrete(bits):
         check(bits)
-        hints.look(volume, camera, transfer, seen, pipeline.compositor, stacklevel=2)
-    return unasked(volume, image, bits)
+        hints.look(volume, view, transfer, seen, pipeline.compositor, stacklevel=2)
+    return volume.unasked(image, bits)
 
 
 @overload
 def render_rays(
-    volume: TetMesh,
+    volume: AbstractVolume,
     origins: Any,
     directions: Any,
     transfer: TransferFunction | None,
@@ -213,7 +217,7 @@ def render_rays(
 
 @overload
 def render_rays(
-    volume: TetMesh,
+    volume: AbstractVolume,
     origins: Any,
     directions: Any,
     transfer: TransferFunction | None,
@@ -233,7 +237,7 @@ def render_rays(
 
 @overload
 def render_rays(
-    volume: TetMesh,
+    volume: AbstractVolume,
     origins: Any,
     directions: Any,
     transfer: TransferFunction | None,
@@ -252,7 +256,7 @@ def render_rays(
 
 
 def render_rays(
-    volume: TetMesh,
+    volume: AbstractVolume,
     origins: Any,
     directions: Any,
     transfer: TransferFunction | None,
@@ -288,25 +292,27 @@ def render_rays(
       where they lie on a face between two cells whose values differ. Silhouettes are left out: of
       an alpha that steps, as those of `XRay` and `MaximumIntensity`, nothing is said.
     """
-    pipeline = _pipeline(tracer_of(tracer), integrator, compositor)
-    rays = rays_of(origins, directions, volume_of(volume), near, far)
+    volume = volume_of(volume)
+    pipeline = _pipeline(tracer_of(tracer, volume), integrator, compositor)
+    require_cuts(pipeline.tracer, near, far)
+    rays = rays_of(origins, directions, volume, near, far)
     transfer = transfer_of(transfer, volume, pipeline.compositor)
     how = _how(pipeline, adjoint, engine, budget, volume)
     with refusing(how[1]):
         scene = bare(volume), rays, bare(transfer)
         last = offset_of(volume), background_of(background)
         rgba, bits = _render_rays(*how, *scene, *last)
-    bits = hold(volume, bits)
+    bits = volume.hold(bits)
     if status:
         return rgba, bits
     if is_concrete(bits):
         check(bits)
-    return unasked(volume, rgba, bits)
+    return volume.unasked(rgba, bits)
 
 
 def trace(
-    volume: TetMesh,
-    camera: Camera | tuple[Any, Any],
+    volume: AbstractVolume,
+    camera: HasRays | tuple[Any, Any],
     *,
     near: Any = None,
     far: Any = None,
@@ -334,14 +340,16 @@ def trace(
             "trace cannot run inside jit or grad, since the number of segments decides the shape "
             "of its result. Call it outside and pass its result in, or use render."
         )
-    tracer, volume = tracer_of(tracer), volume_of(volume)
-    if isinstance(camera, Camera):
-        camera = camera_of(camera, volume)
-        shape, order = (camera.height, camera.width), tile_order(camera.height, camera.width)
-        rays = between(*camera.local_rays(), near, far)
-    else:
+    volume = volume_of(volume)
+    tracer = tracer_of(tracer, volume)
+    require_cuts(tracer, near, far)
+    if is_rays(camera):
         rays = rays_of(*camera, volume, near, far)
         shape, order = rays.origins.shape[:-1], np.arange(rays.origins.size // 3)
+    else:
+        view = camera_of(camera, volume)
+        shape, order = (view.height, view.width), tile_order(view.height, view.width)
+        rays = between(*view.local_rays(), near, far)
     rays = jax.tree.map(lambda x: x[order], flat(rays))
     if native is not None:
         warn(deprecated(f"trace(native={native})", native), DeprecationWarning)
@@ -476,8 +484,8 @@ def _shade(pipeline, adjoint, engine, size, segments, transfer, offset, backgrou
 
 @partial(jax.jit, static_argnums=(1, 2))
 def _count(tracer, engine, size, volume, rays):
-    units = units_of(volume.points, volume.values)
-    volume, rays = mesh_in(units, volume), rays_in(units, rays)
+    units = units_in(volume)
+    volume, rays = volume_in(units, volume), rays_in(units, rays)
     scene = tracer.prepare(volume)
     rays, count = batches(size, rays)
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(rays)
@@ -487,8 +495,8 @@ def _count(tracer, engine, size, volume, rays):
 
 @partial(jax.jit, static_argnums=(1, 2, 6))
 def _fill(tracer, engine, size, volume, rays, start, total):
-    units = units_of(volume.points, volume.values)
-    volume, rays = mesh_in(units, volume), rays_in(units, rays)
+    units = units_in(volume)
+    volume, rays = volume_in(units, volume), rays_in(units, rays)
     scene = tracer.prepare(volume)
     rays, _ = batches(size, rays)
     rays = jax.vmap(partial(tracer.prepare_rays, scene))(rays)
@@ -498,8 +506,8 @@ def _fill(tracer, engine, size, volume, rays, start, total):
 
 def _run(pipeline, adjoint, engine, size, volume, given, transfer, offset):
     """rgba (R, 4) and status (R,) of R rays."""
-    units = units_of(volume.points, volume.values, transfer.positions)
-    volume, given = mesh_in(units, volume), rays_in(units, given)
+    units = units_in(volume, transfer.positions)
+    volume, given = volume_in(units, volume), rays_in(units, given)
     transfer = transfer_in(units, transfer)
     scene = pipeline.tracer.prepare(volume)
     rays, count = batches(size, given)
@@ -511,27 +519,16 @@ def _run(pipeline, adjoint, engine, size, volume, given, transfer, offset):
             rgba = jnp.where(jnp.isnan(end)[:, None], jnp.nan, rgba)
     good = are_rays(given.origins.T, given.directions.T)
     status = jnp.where(good, status, status | LOST)
-    good = _in_range(volume, engine.confirms_cells)
+    good = volume.in_range(engine.confirms_cells)
     return rgba, jnp.where(good, status, BROKEN) | units.status
-
-
-def _in_range(volume: Any, confirmed: bool) -> Array:
-    """Whether integers () of a mesh name points and cells that it has; confirmed: an engine looks
-    at those of cells itself."""
-    count = volume.cells.shape[0]
-    good = jnp.all((volume.boundary >= 0) & (volume.boundary >> 4 < count))
-    if confirmed:
-        return good
-    cells, words = volume.cells, volume.neighbors
-    good = good & jnp.all((cells >= 0) & (cells < volume.points.shape[0]))
-    return good & jnp.all((words >= -1) & (words >> 4 < count))
 
 
 def _finish(pipeline, adjoint, engine, scene, rays, transfer, scale, count):
     nouns = (pipeline.tracer, pipeline.integrator, pipeline.compositor)
     pipeline = Pipeline(*map(refusing_derivatives, nouns))
-    longest = lax.stop_gradient(pipeline.tracer.longest(scene))
-    table = pipeline.integrator.prepare(transfer, longest.dtype, longest)
+    longest = pipeline.tracer.longest(scene)
+    longest = None if longest is None else lax.stop_gradient(longest)
+    table = pipeline.integrator.prepare(transfer, transfer.positions.dtype, longest)
     state, status = adjoint.run(pipeline, Operands(scene, rays, table), engine)
     compositor = pipeline.compositor
     shown = transfer if "transfer" in compositor.needs else None

@@ -32,6 +32,7 @@ from jaxvr._core.status import LENGTHS, SCALARS, UNSORTED
 from jaxvr._core.units import exponent_of, is_large, is_none, is_small, power_of_two, times_told
 from jaxvr.optics import TransferFunction
 from jaxvr.view.rays import Rays
+from jaxvr.volume import AbstractVolume
 
 Array = jax.Array
 
@@ -73,6 +74,19 @@ def units_of(lengths: Array, scalars: Array, positions: Array | None = None, par
     )
 
 
+def units_in(volume: AbstractVolume, positions: Array | None = None) -> Units:
+    """Those for a volume, and for control points."""
+    return units_of(
+        _joined(volume.named(volume.lengths)), _joined(volume.named(volume.scalars)), positions
+    )
+
+
+def _joined(arrays: tuple[Array, ...]) -> Array:
+    if len(arrays) == 1:
+        return arrays[0]
+    return jnp.concatenate([jnp.reshape(x, -1) for x in arrays])
+
+
 def _is_ascending(positions: Array) -> Array:
     held = lax.stop_gradient(positions)
     return jnp.all(held[1:] >= held[:-1]) & jnp.all(jnp.isfinite(held))
@@ -84,11 +98,11 @@ def _ascending(positions: Array) -> Array:
     return lax.cummax(jnp.where(jnp.isfinite(held), held, 0))
 
 
-def mesh_in(units: Units, volume: Any) -> Any:
-    """A mesh in such units."""
-    return dataclasses.replace(
-        volume, points=volume.points * units.length, values=units.of_scalars(volume.values)
-    )
+def volume_in(units: Units, volume: Any) -> Any:
+    """A volume in such units."""
+    lengths = {name: getattr(volume, name) * units.length for name in volume.lengths}
+    scalars = {name: units.of_scalars(getattr(volume, name)) for name in volume.scalars}
+    return dataclasses.replace(volume, **lengths, **scalars)
 
 
 def rays_in(units: Units, rays: Rays) -> Rays:

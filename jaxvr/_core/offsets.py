@@ -94,7 +94,7 @@ def bare(x: Any) -> Any:
     another one they are not compiled again."""
     made = copy.copy(x)
     for name, none in (("origin", NOWHERE), ("offset", 0.0)):
-        if hasattr(x, name):
+        if getattr(x, name, none) != none:
             object.__setattr__(made, name, none)
     return made
 

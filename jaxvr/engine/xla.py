@@ -23,6 +23,7 @@ from jaxvr.adjoint.base import (
     run_batches,
     shade_piece,
 )
+from jaxvr.adjoint.by_rows import reverse_of
 from jaxvr.engine.base import AbstractEngine
 from jaxvr.trace.recorded import fill, record
 
@@ -46,7 +47,8 @@ class XLA(AbstractEngine):
         return run_batches(lambda one: result(march_while(pipeline, one)), operands)
 
     def pull_back(self, pipeline, operands, final, cotangent, asked):
-        tracer, integrator = pipeline.tracer, pipeline.integrator
+        geometric = any(jax.tree.leaves((asked.scene, asked.rays)))
+        tracer, integrator = reverse_of(pipeline.tracer, geometric), pipeline.integrator
         bars = _walk_again(pipeline, operands, final, cotangent, asked)
         scene_bar = tracer.scene_cotangent(operands.scene, bars.scene)
         if bars.table is None:
@@ -67,8 +69,9 @@ def _walk_again(
     pipeline: Pipeline, operands: Operands, finals: Any, state_bar: Any, asked: Asked
 ) -> Cotangents:
     """Gradients of the scene and the table as they are accumulated, the rest as it is to be."""
-    tracer, integrator, compositor = pipeline.tracer, pipeline.integrator, pipeline.compositor
+    integrator, compositor = pipeline.integrator, pipeline.compositor
     geometric = any(jax.tree.leaves((asked.scene, asked.rays)))
+    tracer = reverse_of(pipeline.tracer, geometric)
     optical = any(jax.tree.leaves(asked.table))
     none_of_own = (
         _zeros(integrator) if asked.integrator else None,

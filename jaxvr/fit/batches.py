@@ -23,11 +23,11 @@ import numpy as np
 
 from jaxvr._core.offsets import NOWHERE, said
 from jaxvr._core.pytree import pytree, static
-from jaxvr.arguments import camera_of
+from jaxvr.arguments import camera_of, is_camera
 from jaxvr.fit.targets import images_of
 from jaxvr.render import trace
 from jaxvr.trace import Segments
-from jaxvr.view.camera import Camera
+from jaxvr.view.camera import HasRays
 
 Array = jax.Array
 
@@ -112,7 +112,7 @@ def gather_views(
     elif volume is None:
         raise ValueError("volume is None, but not all of the cameras are Segments.")
     else:
-        dtype = np.dtype(volume.points.dtype)
+        dtype = volume.dtype
         if not cache:
             nodes = _rays(cameras, volume)
             return Views(shapes, flat.astype(dtype), nodes, _tile_rank(shapes), None)
@@ -138,15 +138,15 @@ def _trace(volume: Any, cameras: list[Any], tracer: Any, engine: Any, dtype: Any
     Cameras go together, so that one function is compiled for all, as many as 32-bit indices allow
     with a few hundred segments a ray.
     """
-    group: list[Camera] = []
+    group: list[HasRays] = []
     for k, c in enumerate(cameras):
         if isinstance(c, Segments):
             yield c, np.asarray(c.order)
             continue
         group.append(c)
         after = cameras[k + 1] if k + 1 < len(cameras) else None
-        pixels = sum(g.width * g.height for g in [*group, after] if isinstance(g, Camera))
-        if isinstance(after, Camera) and pixels <= _TOGETHER:
+        pixels = sum(g.width * g.height for g in [*group, after] if is_camera(g))
+        if is_camera(after) and pixels <= _TOGETHER:
             continue
         tiles = np.argsort(_tile_rank([_shape(g) for g in group]))
         origins, directions = _rays(group, volume)
@@ -158,7 +158,7 @@ def _trace(volume: Any, cameras: list[Any], tracer: Any, engine: Any, dtype: Any
 
 def here(volume: Any) -> Any:
     """The volume as if its origin were that of the world: for rays that are relative to it."""
-    return dataclasses.replace(volume, origin=NOWHERE)
+    return dataclasses.replace(volume, origin=NOWHERE) if any(volume.origin) else volume
 
 
 def _offset_of(volume: Any, cameras: list[Any]) -> float:
@@ -174,7 +174,7 @@ def _offset_of(volume: Any, cameras: list[Any]) -> float:
     return found.pop() if found else 0.0
 
 
-def _rays(cameras: list[Camera], volume: Any) -> tuple[np.ndarray, np.ndarray]:
+def _rays(cameras: list[Any], volume: Any) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions (P, 3), as `render` makes them: relative to the volume's origin."""
     rays = [camera_of(c, volume).local_rays() for c in cameras]
     origins, directions = (
@@ -288,11 +288,11 @@ def _count(name: str, n: Any, most: int) -> int:
 
 def listed(cameras: Any) -> list[Any]:
     """Checked cameras or segments; one alone is a list of one."""
-    cameras = [cameras] if isinstance(cameras, Camera | Segments) else cameras
+    cameras = [cameras] if isinstance(cameras, Segments) or is_camera(cameras) else cameras
     if not isinstance(cameras, Sequence):
         raise ValueError(f"cameras must be a list of jaxvr.Camera, not {type(cameras).__name__}.")
     for k, c in enumerate(cameras):
-        if not isinstance(c, Camera | Segments):
+        if not (isinstance(c, Segments) or is_camera(c)):
             raise ValueError(
                 f"cameras[{k}] must be a jaxvr.Camera or jaxvr.Segments, not {type(c).__name__}."
             )
@@ -304,7 +304,7 @@ def listed(cameras: Any) -> list[Any]:
 
 
 def _shape(camera: Any) -> tuple[int, int]:
-    if isinstance(camera, Camera):
-        return camera.height, camera.width
-    height, width = camera.shape
-    return height, width
+    if isinstance(camera, Segments):
+        height, width = camera.shape
+        return height, width
+    return camera.height, camera.width

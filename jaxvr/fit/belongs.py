@@ -13,6 +13,7 @@ import numpy as np
 from jaxvr.fit import digest
 from jaxvr.fit.differences import environment
 from jaxvr.trace import Segments
+from jaxvr.view.camera import Camera
 
 
 def belongs(
@@ -78,4 +79,6 @@ def _view(camera: Any, dtype: Any) -> Any:
         used = int(np.asarray(camera.start)[-1])
         nodes = camera.scalar[:used], camera.length[:used]
         return nodes, camera.start, camera.order, camera.shape, camera.offset
+    if not isinstance(camera, Camera):
+        return [np.asarray(x) for x in camera.rays()]
     return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), camera)

@@ -35,7 +35,6 @@ from jaxvr.arguments import (
     volume_of,
 )
 from jaxvr.composite import AbstractCompositor
-from jaxvr.defaults import diagonal
 from jaxvr.engine import AbstractEngine
 from jaxvr.fit import digest
 from jaxvr.fit.batches import Batch, Views, deal, gather_views, here, listed, make_batches
@@ -141,7 +140,7 @@ def fit(
     pixels = compositor_of(compositor)
     _require_seen(pixels, free)
     given = integrator_of(integrator, pixels), pixels, adjoint_of(adjoint)
-    nouns = (*given, tracer_of(tracer))
+    nouns = (*given, tracer_of(tracer, None if volume is None else volume_of(volume)))
     begin = time.perf_counter()
     control = Control(
         *(iterations, seed, progress, patience, tolerance, checkpoint, checkpoint_every, resume)
@@ -153,7 +152,7 @@ def fit(
     if len(targets) != number_seen:
         raise ValueError(f"There are {number_seen} cameras, but {len(targets)} targets.")
     if volume is not None:
-        hints.look_before_fit(volume_of(volume), cameras, transfer, stacklevel=2)
+        hints.look_before_fit(volume, cameras, transfer, stacklevel=2)
     if held_out is not None:
         more, pictures_of_them = _pair(held_out)
         cameras, targets = cameras + listed(more), targets + pictures_of(pictures_of_them)
@@ -164,7 +163,7 @@ def fit(
     seen, unseen = every.parted(number_seen)
     dtype = seen.targets.dtype
     # A length to measure extinctions by, where the start has none.
-    size = max(float(c.length.max()) for c in cameras) if volume is None else diagonal(volume)
+    size = max(float(c.length.max()) for c in cameras) if volume is None else volume.diagonal()
     parameters = Parameters.of(transfer.astype(dtype), free, size)
     if pixels.needs & {"rgb", "transfer"}:  # else pictures are no colours, and have no bounds
         look_at_targets(seen.split(seen.targets), parameters, background)

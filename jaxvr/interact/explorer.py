@@ -8,14 +8,14 @@ from jaxvr.interact.viewer import Viewer
 from jaxvr.optics import AbstractIntegrator, TransferFunction
 from jaxvr.trace import AbstractTracer
 from jaxvr.view.camera import Camera
-from jaxvr.volume.mesh import TetMesh
+from jaxvr.volume import AbstractVolume
 
 if TYPE_CHECKING:
     from jaxvr.interact.widget import Explorer
 
 
 def explore(
-    volume: TetMesh,
+    volume: AbstractVolume,
     transfer: TransferFunction | None = None,
     camera: Camera | None = None,
     *,
@@ -36,7 +36,7 @@ def explore(
     as soon as it rests.
 
     Args:
-      volume: a `TetMesh`.
+      volume: as for `jaxvr.render`.
       transfer: to start with; None takes `jaxvr.default_transfer` with six points, which spans the
         field's 1 to 99 % quantiles by volume. The widget says what it spans.
       camera: to start with, and its pixels; None takes `Camera.orbit(volume, up=)` with that of the

@@ -18,8 +18,8 @@ from jaxvr._core import svg
 from jaxvr._core.brief import is_known, spanned
 from jaxvr._core.checks import require_kind
 from jaxvr._core.status import check
-from jaxvr.arguments import background_of
-from jaxvr.defaults import QUANTILES, UPS, best_up, default_transfer, diagonal
+from jaxvr.arguments import background_of, volume_of
+from jaxvr.defaults import QUANTILES, UPS, best_up, default_transfer
 from jaxvr.interact import edits as _edits
 from jaxvr.interact.orbit import AXES, Orbit
 from jaxvr.interact.pace import Pace
@@ -28,8 +28,7 @@ from jaxvr.optics import AbstractIntegrator, Analytic, TransferFunction
 from jaxvr.render import render, shade, trace
 from jaxvr.trace import AbstractTracer, Segments
 from jaxvr.view.camera import Camera
-from jaxvr.volume.mesh import TetMesh
-from jaxvr.volume.statistics import used_values, value_range
+from jaxvr.volume import AbstractVolume
 
 # More segments than this are not kept: views are rendered then.
 SEGMENT_BYTES = 1 << 30
@@ -63,7 +62,7 @@ class Viewer:
 
     def __init__(
         self,
-        volume: TetMesh,
+        volume: AbstractVolume,
         transfer: TransferFunction | None = None,
         camera: Camera | None = None,
         *,
@@ -73,14 +72,14 @@ class Viewer:
         integrator: AbstractIntegrator | None = None,
         background: Any = (1.0, 1.0, 1.0),
     ):
-        require_kind("volume", volume, TetMesh)
+        volume = volume_of(volume)
         if camera is not None:
             require_kind("camera", camera, Camera)
         if coarse is not None and (not isinstance(coarse, int) or coarse < 1):
             raise ValueError(f"coarse must be pixels of a side, at least 1, but is {coarse!r}.")
         self.volume, self.tracer, self.integrator = volume, tracer, integrator
         self.background = background_of(background)
-        self.range = value_range(volume)
+        self.range = volume.value_range()
         self._told = ""
         if transfer is None:
             transfer = default_transfer(volume, points=POINTS)
@@ -90,7 +89,7 @@ class Viewer:
         self.chosen_up = "" if camera is not None else best_up(volume, self._transfer)
         if camera is None:
             camera = Camera.orbit(volume, up=UPS[self.chosen_up], width=size, height=size)
-        self.orbit = self._first_orbit = Orbit.of(camera, diagonal(volume) / 2)
+        self.orbit = self._first_orbit = Orbit.of(camera, volume.diagonal() / 2)
         self.width, self.height = camera.width, camera.height
         # Shading is faster than rendering, so it may have more pixels.
         self._paces = {
@@ -231,13 +230,13 @@ class Viewer:
 
     def setup(self) -> dict[str, Any]:
         """What does not change, as a message: size, range of the field, its histogram, names."""
-        counts, _ = svg.histogram(used_values(self.volume), *self.range)
+        counts, _ = svg.histogram(self.volume.weighted_values()[0], *self.range)
         return {
             "width": self.width,
             "height": self.height,
             "range": list(self.range),
             "counts": counts.tolist(),
-            "field": self.volume.report.field or "values",
+            "field": self.volume.field_name or "values",
             "ups": list(AXES),
             "views": {name: list(angles) for name, angles in VIEWS.items()},
         }

@@ -66,10 +66,11 @@ class AbstractIntegrator(abc.ABC):
         """The same integrals for segments that come from behind: light leaves by their `back`."""
 
     @abc.abstractmethod
-    def prepare(self, transfer: TransferFunction, dtype: Any, longest: Array) -> Any:
+    def prepare(self, transfer: TransferFunction, dtype: Any, longest: Array | None) -> Any:
         """The table that `step` looks up, differentiable with respect to `transfer`.
 
-        longest (): a bound on the length of a segment, a constant to derivatives.
+        longest (): a bound on the length of a segment, a constant to derivatives; None where the
+            tracer gives none.
         """
 
     @abc.abstractmethod

@@ -115,6 +115,11 @@ class PreIntegration(AbstractWholeIntegrator):
     def prepare(self, transfer, dtype, longest):
         nodes = nodes_of(transfer, dtype)
         low, high = nodes.position[0], nodes.position[-1]
+        if longest is None:
+            raise ValueError(
+                "PreIntegration has a table up to the longest segment there can be, and this "
+                "tracer gives no bound: write its longest(scene), or take Analytic()."
+            )
         longest = jnp.where(longest > 0, longest, 1).astype(dtype)
         slices = self._build(nodes, longest)
         if self.bits is not None:

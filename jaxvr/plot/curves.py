@@ -11,8 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from jaxvr._core.checks import as_floats, require_finite, require_shape
 from jaxvr.optics.transfer import TransferFunction
 from jaxvr.plot.axes import color_as, ink, legend_of, new_axes, set_title
-from jaxvr.volume.mesh import TetMesh
-from jaxvr.volume.statistics import used_values
+from jaxvr.volume import AbstractVolume
 
 # More control points than this are not marked one by one.
 MARKED = 64
@@ -31,8 +30,9 @@ def transfer(
     Args:
       tf: the transfer function.
       reference: another one, dashed, with the colours of both as strips on top.
-      values: a `TetMesh` or an array of scalars: how many values there are of each size, as a
-        faint histogram with a logarithmic height of its own. A mesh names the axis after its field.
+      values: a volume or an array of scalars: how many values there are of each size, as a
+        faint histogram with a logarithmic height of its own. A volume
+        names the axis after its field.
 
     Raises ValueError for what is no transfer function, and for NaN in values.
     """
@@ -71,7 +71,7 @@ def transfer(
         _histogram(ax, data, 0.95 * top / room)
     ax.set_xlim(lo, hi)
     ax.set_ylim(0, room)
-    ax.set_xlabel((isinstance(values, TetMesh) and values.report.field) or "scalar")
+    ax.set_xlabel((isinstance(values, AbstractVolume) and values.field_name) or "scalar")
     ax.set_ylabel("extinction per unit length")
     if len(both) > 1 or data is not None:
         legend_of(ax, fontsize="small", loc="best")
@@ -192,7 +192,7 @@ def _histogram(ax: Axes, data: np.ndarray, height: float) -> None:
 
 
 def _scalars(values: Any) -> np.ndarray:
-    values = used_values(values) if isinstance(values, TetMesh) else values
+    values = values.weighted_values()[0] if isinstance(values, AbstractVolume) else values
     data = np.asarray(as_floats("values", values), np.float64).ravel()
     if len(data) == 0:
         raise ValueError("There are no values: leave them out.")

@@ -8,15 +8,16 @@ split in the manner of an iterative method:
 - `start` and `step` move rays (R,) from segment to segment, in lock step: a `state` shows the
   current segment, which rays have one (`active`), and which of those segments do not start at the
   scalar where the one before ended (`fresh`);
-- `reversed` is the tracer of the same segments from behind, where there is one;
-- `pull_back` takes the cotangents of the current segment back to the floats of the scene and the
-  rays, from the local operands alone. The replaying adjoint needs no more than that.
+- `address` and `segment` say what the current segment hangs on, and how: rows of the scene's
+  arrays, what all segments share, and the ray. The replaying adjoint needs no more than that.
+  (Those for tetrahedra have `pull_back` instead, which does the same by hand.)
+- `reversed` is the tracer of the same segments from behind, where there is one.
 
 Integers are found without derivatives; floats are derived from what they gather. A new tracer is
-one file, listed here and in the tests' registry.
+one file, listed here and in the tests' registry; notebooks/contribute.md has two.
 """
 
-from jaxvr.trace.base import AbstractTracer
+from jaxvr.trace.base import AbstractTracer, Store
 from jaxvr.trace.kbuffer import KBuffer
 from jaxvr.trace.measure import KMap, measure_k
 from jaxvr.trace.rasterize import Fragments, rasterize
@@ -31,6 +32,7 @@ __all__ = [
     "RayCast",
     "Recorded",
     "Segments",
+    "Store",
     "measure_k",
     "rasterize",
 ]

@@ -46,7 +46,7 @@ from __future__ import annotations
 
 import dataclasses
 import numbers
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -106,7 +106,7 @@ from jaxvr.trace.stream import (
     tolerance,
 )
 from jaxvr.view.rays import Rays
-from jaxvr.volume import packing
+from jaxvr.volume import TetMesh, packing
 
 Array = jax.Array
 
@@ -179,6 +179,9 @@ class KBuffer(AbstractTracer):
     Raises:
       ValueError: if k is not a positive integer, or order or pairs are not what they may be.
     """
+
+    takes: ClassVar[type] = TetMesh
+    cuts: ClassVar[bool] = True
 
     k: int = static(default=6)
     order: AbstractOrder = static(default=Centroid())

@@ -34,7 +34,7 @@ inverted cells in 28,800) that is one ray in 700.
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -155,6 +155,9 @@ class RayCast(AbstractTracer):
     reverse: the farthest segments first; an `Over` that composites back to front sets it. A ray
         from behind is a ray: it comes the other way, and ends at the eye.
     """
+
+    takes: ClassVar[type] = TetMesh
+    cuts: ClassVar[bool] = True
 
     reverse: bool = static(default=False)
 

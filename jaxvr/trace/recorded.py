@@ -12,7 +12,7 @@ by the same length, and a node of length 0 stays where it is; the next starts an
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -91,6 +91,8 @@ class Recorded(AbstractTracer):
 
     reverse: from behind; an `Over` that composites back to front sets it.
     """
+
+    takes: ClassVar[type] = Segments
 
     reverse: bool = static(default=False)
 

@@ -61,6 +61,41 @@ class HasBounds(Protocol):
         ...
 
 
+class HasRays(Protocol):
+    """A camera: what gives a ray for each pixel. `Camera` is one; one of another maker may be any
+    object, and a pytree if it is to be differentiated."""
+
+    @property
+    def width(self) -> int: ...
+
+    @property
+    def height(self) -> int: ...
+
+    def rays(self) -> tuple[Any, Any]:
+        """Origins and directions (height, width, 3) in the world, row 0 on top; directions of any
+        length but 0. For volumes far from 0 in float32 give NumPy's float64."""
+        ...
+
+
+@pytree
+class RayImage:
+    """Rays (height, width, 3) of an image: origins relative to a volume's, and directions."""
+
+    origins: Array
+    directions: Array
+
+    @property
+    def height(self) -> int:
+        return self.origins.shape[0]
+
+    @property
+    def width(self) -> int:
+        return self.origins.shape[1]
+
+    def local_rays(self) -> tuple[Array, Array]:
+        return self.origins, self.directions
+
+
 @pytree
 class Camera:
     """A view of the world. Make one with `look_at`, `orthographic`, `orbit` or `sphere`.

@@ -30,6 +30,14 @@ class Rays:
     near: Array | None = None
     far: Array | None = None
 
+    def bounds(self) -> tuple[Array, Array]:
+        """near and far (R,), whether or not they are given."""
+        none = jnp.zeros_like(self.origins[..., 0])
+        return (
+            none if self.near is None else self.near,
+            none + jnp.inf if self.far is None else self.far,
+        )
+
     def reversed(self) -> Rays:
         """The same lines, run through from behind: what is at the distance t is at -t."""
         none = jnp.zeros_like(self.origins[..., 0])

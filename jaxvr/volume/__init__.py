@@ -2,7 +2,8 @@
 
 What one is. A volume is a pytree of arrays: floats, which may be differentiated (`points`,
 `values`), and integers, which are found once when it is built and never again (`cells`,
-`neighbors`, `boundary`). `TetMesh` is the unstructured one; its docstring has all shapes.
+`neighbors`, `boundary`). `AbstractVolume` has what the doors ask of any; `TetMesh` is the
+unstructured one, whose docstring has all shapes.
 
 What holds for every `TetMesh`, whatever it was made from:
 - the four welded ids of a cell are distinct, and each row of `cells` ascends by them, so that both
@@ -18,11 +19,13 @@ signs (`geometry`), adjacency and fold bits (`connectivity`), values (`values`).
 
 To add a reader or a generator: make points, a dict of cells and values, and call
 `TetMesh.from_cells`, which checks and repairs. To add a cell type: a `CellKind` in `cells`, with
-its reference corners and its faces. To add another kind of volume: a pytree in a file of its own,
-with `bounds()`, `replace()` and `describe()`, whose factory validates as `build` does.
+its reference corners and its faces. To add another kind of volume: a pytree in a file of its own
+that derives from `AbstractVolume`, and a tracer that walks through it (notebooks/contribute.md has
+both).
 """
 
 from . import datasets
+from .base import AbstractVolume
 from .mesh import TetMesh
 from .plot3d import read_plot3d
 from .quality import Quality, quality
@@ -31,6 +34,7 @@ from .refine import delaunay_deviation, refine
 from .report import MeshReport
 
 __all__ = [
+    "AbstractVolume",
     "Field",
     "MeshReport",
     "Quality",

@@ -136,6 +136,18 @@ def unasked(mesh: Any, image: Array, bits: Array) -> Array:
     return image * jnp.where(broken, jnp.nan, 1).astype(image.dtype)[..., None]
 
 
+def in_range(mesh: Any, compiled: bool) -> Array:
+    """Whether integers () of a mesh name points and cells that it has. Compiled loops look at those
+    of cells themselves, as they load them."""
+    count = mesh.cells.shape[0]
+    good = jnp.all((mesh.boundary >= 0) & (mesh.boundary >> 4 < count))
+    if compiled:
+        return good
+    cells, words = mesh.cells, mesh.neighbors
+    good = good & jnp.all((cells >= 0) & (cells < mesh.points.shape[0]))
+    return good & jnp.all((words >= -1) & (words >> 4 < count))
+
+
 def _is_traced(mesh: Any) -> bool:
     return not is_concrete(mesh.points, *_connectivity(mesh))
 

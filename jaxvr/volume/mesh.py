@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -26,19 +26,23 @@ from .._core.offsets import (
     said,
 )
 from .._core.pytree import pytree, static
+from . import integrity, statistics
+from .base import AbstractVolume
 from .build import build, require_sound
 from .digits import coarse_cells
 from .integrity import require_connectivity, trust, trust_entries
 from .mirror import mirrored
 from .report import MeshReport, coarse_warning
-from .statistics import used_points
 from .values import choose_location, less_offset, place
+
+if TYPE_CHECKING:
+    from jaxvr.trace.base import AbstractTracer
 
 Array = jax.Array
 
 
 @pytree
-class TetMesh:
+class TetMesh(AbstractVolume):
     """Tetrahedra with a scalar field. Make one with `TetMesh.from_cells` or `jaxvr.read_mesh`.
 
     points (P, 3): relative to `origin`; points that coincide are kept apart.
@@ -72,6 +76,9 @@ class TetMesh:
     beside them from being boundaries, and a ray passes them in no length. The same goes for cells
     that moved points turn over: a ray waits in them where it is, until it gets farther again.
     """
+
+    lengths: ClassVar[tuple[str, ...]] = ("points",)
+    scalars: ClassVar[tuple[str, ...]] = ("values",)
 
     points: Array
     values: Array
@@ -215,7 +222,7 @@ class TetMesh:
         exact = as_floats("points", np.asarray(points), dtype=np.float64)
         require_finite("points", exact)
         cells = np.asarray(self.cells) if is_concrete(self.cells) else None
-        used = exact if cells is None else exact[used_points(self)]
+        used = exact if cells is None else exact[statistics.used_points(self)]
         away = np.asarray(origin_between(used.min(axis=0), used.max(axis=0), self.dtype))
         if wide and (origin is None or not is_single(points)):
             place, away = added(place, away)
@@ -239,7 +246,7 @@ class TetMesh:
         require_finite("values", exact)
         used = exact.reshape(-1)
         if exact.shape == (self.n_points,) and is_concrete(self.cells):
-            used = exact[used_points(self)]
+            used = exact[statistics.used_points(self)]
         if used.size == 0:
             return self._floats("values", values), away
         more, message = less_offset(given, used, self.dtype)
@@ -294,6 +301,57 @@ class TetMesh:
         `origin` as these are."""
         used = self.points[self.cells.reshape(-1)]
         return used.min(axis=0), used.max(axis=0)
+
+    def default_tracer(self) -> AbstractTracer:
+        """`RayCast()`."""
+        from jaxvr.trace import RayCast
+
+        return RayCast()
+
+    def require(self) -> None:
+        integrity.require_mesh(self)
+
+    def hold(self, bits: Array) -> Array:
+        return integrity.hold(self, bits)
+
+    def unasked(self, image: Array, bits: Array) -> Array:
+        return integrity.unasked(self, image, bits)
+
+    def in_range(self, compiled: bool) -> Array:
+        return integrity.in_range(self, compiled)
+
+    def value_range(self) -> tuple[float, float]:
+        """The least and the largest value that a cell uses, with the offset."""
+        return statistics.value_range(self)
+
+    def weighted_values(self) -> tuple[np.ndarray, np.ndarray]:
+        """See `jaxvr.volume.statistics.weighted_values`."""
+        return statistics.weighted_values(self)
+
+    def levels(self) -> np.ndarray | None:
+        return self.absolute_values() if self.location == "cell" else None
+
+    def hull(self) -> np.ndarray:
+        """The points (P, 3) that cells use, float64."""
+        return np.asarray(self.points, np.float64)[statistics.used_points(self)]
+
+    def dots(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Middles, volumes and mean values of the cells."""
+        return statistics.dots(self)
+
+    def glance(self) -> tuple[Array | None, Array, Array]:
+        # A point without a cell would widen the range of values. The box is of all points.
+        return self.cells if self.location == "point" else None, self.values, self.points
+
+    @property
+    def parts(self) -> int:
+        """Number of tetrahedra."""
+        return self.n_tets
+
+    @property
+    def field_name(self) -> str:
+        """What the scalar was called where it was read."""
+        return self.report.field or ""
 
     def describe(self) -> str:
         """A page on the mesh for people: counts, repairs, components, boundary, box, quality,

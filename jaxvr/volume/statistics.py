@@ -15,6 +15,7 @@ from .geometry import signed_volumes
 from .unused import used_by
 
 if TYPE_CHECKING:
+    from .base import AbstractVolume
     from .mesh import TetMesh
 
 
@@ -62,10 +63,21 @@ def weighted_values(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     return values[used], parts[used]
 
 
-def quantiles(mesh: TetMesh, parts: Sequence[float]) -> list[float]:
+def dots(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Middles (T, 3), volumes (T,) and mean values (T,) of the cells, float64."""
+    cells, points = np.asarray(mesh.cells), np.asarray(mesh.points, np.float64)
+    size = np.abs(signed_volumes(points, cells)[0]) / 6
+    values = mesh.absolute_values()
+    if mesh.location == "point":
+        values = values[cells]
+    values = values if values.ndim == 1 else values.mean(axis=1)
+    return points[cells].mean(axis=1), size, values
+
+
+def quantiles(volume: AbstractVolume, parts: Sequence[float]) -> list[float]:
     """For each part, from 0 to 1, the least value that with those below it fills so much of the
     volume; 0 and 1 give the range."""
-    values, weights = weighted_values(mesh)
+    values, weights = volume.weighted_values()
     order = np.argsort(values, kind="stable")
     values, reached = values[order], np.cumsum(weights[order])
     at = np.searchsorted(reached, np.asarray(parts) * reached[-1])
