@@ -3,8 +3,8 @@
 A tracer is a frozen dataclass, whose numbers are leaves and the rest static (`_core.pytree.noun`),
 split in the manner of an iterative method:
 
-- `prepare(volume)` and `prepare_rays(...)` make the arrays that a step reads, differentiably; what a
-  step is to read of the tracer's own numbers goes into the scene, for derivatives by `Replay`;
+- `prepare(volume)` and `prepare_rays(...)` make the arrays that a step reads, differentiably; what
+  a step is to read of the tracer's own numbers goes into the scene, for derivatives by `Replay`;
 - `start` and `step` move rays (R,) from segment to segment, in lock step: a `state` shows the
   current segment, which rays have one (`active`), and which of those segments do not start at the
   scalar where the one before ended (`fresh`);
