@@ -24,6 +24,7 @@ import jaxvr.plot
 from jaxvr import cli
 from jaxvr.adjoint.base import AbstractAdjoint
 from jaxvr.composite import AbstractCompositor
+from jaxvr.engine import AbstractEngine
 from jaxvr.optics import AbstractIntegrator
 from jaxvr.order import AbstractOrder
 from jaxvr.trace.base import AbstractTracer
@@ -189,7 +190,10 @@ def resolve(dotted: str):
 
 PUBLIC = sorted({name for names in public().values() for name in names})
 # What renderers call, and users do not: bases describe the arguments, by their shapes.
-SWAPPED = (AbstractTracer, AbstractIntegrator, AbstractAdjoint, AbstractOrder, AbstractCompositor)
+SWAPPED = (
+    *(AbstractTracer, AbstractIntegrator, AbstractAdjoint, AbstractOrder, AbstractCompositor),
+    AbstractEngine,
+)
 
 
 @pytest.mark.parametrize("dotted", PUBLIC)
