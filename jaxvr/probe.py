@@ -8,7 +8,6 @@ segment adds to the colour at the eye. The contributions of a ray add up to its 
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
@@ -17,6 +16,7 @@ import numpy as np
 from jax import lax
 
 from jaxvr._core.checks import is_concrete
+from jaxvr._core.compiling import compiled
 from jaxvr._core.offsets import absolute, bare
 from jaxvr._core.status import check
 from jaxvr.adjoint.base import Operands, Pipeline, advance, begin, busy, shade_piece
@@ -190,7 +190,7 @@ def _pixels_of(pixels: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndar
     return row, column
 
 
-@jax.jit
+@compiled()
 def _prepare(pipeline: Pipeline, volume: Any, transfer: Any) -> tuple[Any, Any, Units]:
     units = units_in(volume, transfer.positions)
     volume, transfer = volume_in(units, volume), transfer_in(units, transfer)
@@ -199,7 +199,7 @@ def _prepare(pipeline: Pipeline, volume: Any, transfer: Any) -> tuple[Any, Any, 
     return scene, pipeline.integrator.prepare(transfer, volume.dtype, longest), units
 
 
-@jax.jit
+@compiled()
 def _count(tracer: AbstractTracer, scene: Any, origins: Array, directions: Array) -> Any:
     """Nodes, as many as segments or more, and status of R rays."""
     rays = tracer.prepare_rays(scene, Rays(origins, directions))
@@ -207,7 +207,7 @@ def _count(tracer: AbstractTracer, scene: Any, origins: Array, directions: Array
     return tuple(x[0] for x in found)
 
 
-@partial(jax.jit, static_argnums=1)
+@compiled(1)
 def _walk(pipeline: Pipeline, most: int, scene: Any, table: Any, origins: Any, directions: Any):
     """Number of segments (R,), then of each, (R, most, ...): cell, distance of the back, length,
     scalars and contribution."""

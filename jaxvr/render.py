@@ -23,6 +23,7 @@ from jax import lax
 
 from jaxvr import hints
 from jaxvr._core.checks import is_concrete
+from jaxvr._core.compiling import compiled
 from jaxvr._core.offsets import bare
 from jaxvr._core.pytree import refusing_derivatives, with_leaves_of
 from jaxvr._core.status import BROKEN, LOST, check
@@ -440,7 +441,7 @@ def _pipeline(
     return Pipeline(tracer, integrator, compositor)
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))
+@compiled(1, 2, 3)
 def _render(pipeline, adjoint, engine, size, volume, camera, transfer, offset, background):
     # Under a user's own jit operands may be constants: XLA must not compute with them itself.
     volume, camera = lax.optimization_barrier((volume, camera))
@@ -452,7 +453,7 @@ def _render(pipeline, adjoint, engine, size, volume, camera, transfer, offset, b
     return rgba, untile(status[:, None], height, width)[..., 0], seen
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))
+@compiled(1, 2, 3)
 def _render_rays(pipeline, adjoint, engine, size, volume, rays, transfer, offset, background):
     shape = rays.origins.shape[:-1]
     volume, rays = lax.optimization_barrier((volume, rays))
@@ -460,7 +461,7 @@ def _render_rays(pipeline, adjoint, engine, size, volume, rays, transfer, offset
     return _over(rgba, background).reshape(*shape, 4), status.reshape(shape)
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))
+@compiled(1, 2, 3)
 def _shade(pipeline, adjoint, engine, size, segments, transfer, offset, background):
     segments = lax.optimization_barrier(segments)  # as above
     units = units_of(segments.length, segments.scalar, transfer.positions, parts=_PARTS)
@@ -482,7 +483,7 @@ def _shade(pipeline, adjoint, engine, size, segments, transfer, offset, backgrou
     return _over(rgba, background).reshape(*segments.shape, 4), units.status
 
 
-@partial(jax.jit, static_argnums=(1, 2))
+@compiled(1, 2)
 def _count(tracer, engine, size, volume, rays):
     units = units_in(volume)
     volume, rays = volume_in(units, volume), rays_in(units, rays)
@@ -493,7 +494,7 @@ def _count(tracer, engine, size, volume, rays):
     return number, status | units.status
 
 
-@partial(jax.jit, static_argnums=(1, 2, 6))
+@compiled(1, 2, 6)
 def _fill(tracer, engine, size, volume, rays, start, total):
     units = units_in(volume)
     volume, rays = volume_in(units, volume), rays_in(units, rays)

@@ -9,7 +9,6 @@ any, do the same.
 from __future__ import annotations
 
 import functools
-import importlib
 from typing import Any
 
 import jax
@@ -44,19 +43,6 @@ rounded_jit = functools.partial(
     jax.jit, compiler_options=EMITTERS | {"xla_backend_optimization_level": 3}
 )
 
-# Functions of modules and their static arguments. (`jaxvr.render` and `jaxvr.probe` are functions.)
-STATIC = {
-    "jaxvr.render": {
-        "_render": (1, 2, 3),
-        "_render_rays": (1, 2, 3),
-        "_shade": (1, 2, 3),
-        "_count": (1, 2),
-        "_fill": (1, 2, 6),
-    },
-    "jaxvr.probe": {"_prepare": (), "_count": (), "_walk": (1,)},
-    "jaxvr.trace.measure": {"_measure": (0, 1)},
-}
-
 
 def outermost_jit(function: Any = None, **options: Any) -> Any:
     """A stand-in for `jax.jit` that compiles quickly what is not called within another `jit`."""
@@ -72,27 +58,3 @@ def outermost_jit(function: Any = None, **options: Any) -> Any:
     for name in ("lower", "_cache_size", "clear_cache"):
         setattr(call, name, getattr(quick, name))
     return call
-
-
-class Verb:
-    """A compiled function of a module in quick code; what is traced is left to the caller's own
-    `jit` or `grad`, since options are those of the outermost."""
-
-    def __init__(self, module: str, name: str):
-        self.module: Any = importlib.import_module(module)
-        self.name = name
-        self.own: Any = getattr(self.module, name)
-        self.quick: Any = jit(self.own.__wrapped__, static_argnums=STATIC[module][name])
-
-    def __call__(self, *args):
-        concrete = is_concrete(*jax.tree.leaves(args))
-        return (self.quick if concrete else self.own)(*args)
-
-    def _cache_size(self) -> int:
-        return self.own._cache_size() + self.quick._cache_size()
-
-
-@functools.cache
-def verbs() -> list[Verb]:
-    """Made once, so that all modules share what is compiled."""
-    return [Verb(module, name) for module, names in STATIC.items() for name in names]

@@ -16,6 +16,7 @@ import jaxvr
 from experiments import (
     beside_vtk,
     control_points,
+    cut_and_merge,
     demo,
     file_faults,
     fit_transfer,
@@ -86,6 +87,12 @@ def offsets_error(folder: Path) -> float:
     errors = [x for x in found.values() if x is not None]
     assert len(errors) == len(found) > 20
     return max(errors)
+
+
+def cut_and_merge_apart(folder: Path) -> float:
+    mesh = jaxvr.datasets.box((3, 3, 3), jitter=0.2, seed=1)
+    found = cut_and_merge.run(mesh, 64)
+    return max(x for by_engine in found.values() for x in by_engine.values())
 
 
 def units_range(folder: Path) -> float:
@@ -271,6 +278,7 @@ EXPERIMENTS = [
     (limits_cells, 5, 20),
     (units_range, 98, 100),
     (offsets_error, 1e-8, 1e-5),
+    (cut_and_merge_apart, 1e-9, 1e-6),
     (library_faults_good, 0.999, 1.001),
     (mesh_faults_wrong, -1, 1),
     (file_faults_wrong, -1, 1),

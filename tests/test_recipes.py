@@ -263,7 +263,7 @@ def test_any_camera_gives_what_its_rays_give(dtype):
     camera = registry.camera_of(dtype)
     image = jaxvr.render(mesh, camera, transfer)
     same = jaxvr.render(mesh, Given(*camera.rays()), transfer)
-    # The same bits in test_camera: quick code rounds rays in another way within than without.
+    # Quick code rounds rays in another way within a compiled function than without.
     assert np.allclose(image, same, rtol=0, atol=1e-14 if dtype == "float64" else 5e-6)
     segments = [jaxvr.trace(mesh, c) for c in (camera, Given(*camera.rays()))]
     assert segments[0].shape == segments[1].shape == (5, 6)

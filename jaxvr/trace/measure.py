@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -24,6 +23,7 @@ import numpy as np
 from jax import lax
 
 from jaxvr._core.checks import is_concrete
+from jaxvr._core.compiling import compiled
 from jaxvr._core.offsets import bare
 from jaxvr._core.units import require_lengths
 from jaxvr.order import AbstractOrder, Centroid
@@ -147,7 +147,7 @@ def _prepare(volume: TetMesh) -> CellFaces:
     return cell_faces(make_scene(volume))
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@compiled(0, 1)
 def _measure(sort: Sort, most: int, source: CellFaces, origins: Array, directions: Array) -> Any:
     """entries, moved and fragments of batches of rays (batches, R), counted up to `most`."""
     size, dtype = origins.shape[1], origins.dtype
