@@ -29,7 +29,7 @@ class Compiled:
     def __init__(self, function: Callable[..., Any], static: tuple[int, ...]):
         functools.update_wrapper(self, function)
         self._compile = functools.partial(jax.jit, function, static_argnums=static)
-        self._own = self._compile()
+        self._own: Any = self._compile()
         self._with: dict[Any, Any] = {}
 
     def __call__(self, *args: Any) -> Any:
