@@ -14,6 +14,7 @@ import pytest
 
 import jaxvr
 from experiments import (
+    against,
     beside_vtk,
     control_points,
     cut_and_merge,
@@ -87,6 +88,15 @@ def offsets_error(folder: Path) -> float:
     errors = [x for x in found.values() if x is not None]
     assert len(errors) == len(found) > 20
     return max(errors)
+
+
+def against_itself(folder: Path) -> float:
+    folder.mkdir()
+    jaxvr.write_mesh(folder / "mesh.vtu", jaxvr.datasets.box((2, 2, 2)))
+    here = against.HERE
+    rows = against.compare(here, here, folder / "mesh.vtu", 16, "C", 3, tasks=["render"])
+    assert rows[0]["seconds"] > 0
+    return rows[0]["ratio"]
 
 
 def cut_and_merge_apart(folder: Path) -> float:
@@ -279,6 +289,7 @@ EXPERIMENTS = [
     (units_range, 98, 100),
     (offsets_error, 1e-8, 1e-5),
     (cut_and_merge_apart, 1e-9, 1e-6),
+    (against_itself, 0.05, 20),
     (library_faults_good, 0.999, 1.001),
     (mesh_faults_wrong, -1, 1),
     (file_faults_wrong, -1, 1),
