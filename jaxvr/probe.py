@@ -50,7 +50,8 @@ class Probe:
     start (R + 1,): the segments of ray r are number start[r] to start[r + 1] - 1.
     cells (S,) int32: rows of `mesh.cells`, the tetrahedra that the segments lie in; of another
         volume what its tracer numbers.
-    distances (S, 2): from the ray's origin to the front and the back, in world units.
+    distances (S, 2): from the ray's origin to the front and the back, in world units; they descend
+        where a folded cell leads the ray back.
     scalars (S, 2): the field at front and back; float64 where the mesh has an offset.
     contributions (S, 4): premultiplied RGBA that each adds at the eye, dimmed by what is in front.
     positions (S, 2, 3): the front and the back, in the world; float64 where the mesh has an origin.
@@ -78,7 +79,7 @@ class Probe:
     @property
     def lengths(self) -> np.ndarray:
         """World lengths (S,) of the segments."""
-        return self.distances[:, 1] - self.distances[:, 0]
+        return np.abs(self.distances[:, 1] - self.distances[:, 0])
 
     @property
     def rgba(self) -> np.ndarray:
@@ -159,10 +160,9 @@ def probe(
         status.append(np.asarray(bits)[:used])
     check(np.concatenate(status) | np.asarray(units.status))
     start = np.concatenate([[0], np.cumsum(np.concatenate(counts), dtype=np.int64)])
-    cells, back, length, scalars, contributions = (np.concatenate(x) for x in zip(*parts))
-    back, length = back / np.asarray(units.length), length / np.asarray(units.length)
+    cells, distances, scalars, contributions = (np.concatenate(x) for x in zip(*parts))
+    distances = np.maximum(distances, 0) / np.asarray(units.length)
     scalars = scalars / np.asarray(units.scalar)
-    distances = np.stack([np.maximum(back - length, 0), back], axis=1)
     ray = np.repeat(np.arange(len(origins)), np.diff(start))
     positions = origins[ray][:, None] + distances[..., None] * directions[ray][:, None]
     if any(volume.origin):
@@ -209,8 +209,8 @@ def _count(tracer: AbstractTracer, scene: Any, origins: Array, directions: Array
 
 @compiled(1)
 def _walk(pipeline: Pipeline, most: int, scene: Any, table: Any, origins: Any, directions: Any):
-    """Number of segments (R,), then of each, (R, most, ...): cell, distance of the back, length,
-    scalars and contribution."""
+    """Number of segments (R,), then of each, (R, most, ...): cell, distances, scalars and
+    contribution."""
     tracer, compositor = pipeline.tracer, pipeline.compositor
     rays = tracer.prepare_rays(scene, Rays(origins, directions))
     operands = Operands(scene, rays, table)
@@ -220,22 +220,21 @@ def _walk(pipeline: Pipeline, most: int, scene: Any, table: Any, origins: Any, d
     def body(carry):
         march, place, seen, out = carry
         segment = march.trace.segment
-        cell, back = tracer.locate(scene, rays, march.trace)
+        cell, *distances = tracer.locate(scene, rays, march.trace)
         pixel, cursor, finished, *_ = shade_piece(pipeline, operands, march)
         live = march.trace.active & finished & (segment.length > 0)
         rgba = compositor.finish(pixel, None, None).T
-        scalars = jnp.stack([segment.front, segment.back], axis=1)
-        new = (cell, back, segment.length, scalars, rgba - seen)
+        ends = ((segment.front, segment.back), distances)
+        scalars, distances = (jnp.stack(pair, axis=1) for pair in ends)
+        new = (cell, distances, scalars, rgba - seen)
         to = jnp.where(live, place, most)
         out = tuple(x.at[lane, to].set(y, mode="drop") for x, y in zip(out, new, strict=True))
         march = advance(pipeline, operands, march._replace(pixel=pixel, cursor=cursor), finished)
         return march, place + live, jnp.where(live[:, None], rgba, seen), out
 
-    numbers = jnp.zeros((size, most), dtype)
-    out = (
-        jnp.zeros((size, most), jnp.int32),
-        *(numbers, numbers, jnp.zeros((size, most, 2), dtype), jnp.zeros((size, most, 4), dtype)),
-    )
+    pairs = jnp.zeros((size, most, 2), dtype)
+    cells = jnp.zeros((size, most), jnp.int32)
+    out = (cells, pairs, pairs, jnp.zeros((size, most, 4), dtype))
     march = begin(pipeline, operands)
     carry = (march, jnp.zeros(size, jnp.int32), jnp.zeros((size, 4), dtype), out)
     _, place, _, out = lax.while_loop(lambda c: busy(c[0]), body, carry)

@@ -3,11 +3,14 @@ that cell at its ends, and the contributions add up to the picture."""
 
 from __future__ import annotations
 
+import warnings
+
 import jax
 import numpy as np
 import pytest
 
 import jaxvr
+from jaxvr import testing
 
 pytestmark = pytest.mark.usefixtures("quick_code")
 
@@ -51,6 +54,23 @@ def test_segments_lie_in_their_cells_and_add_up_to_the_picture(tracer, dtype):
     gaps = (found.distances[1:, 0] - found.distances[:-1, 1])[same]
     np.testing.assert_allclose(gaps, 0, atol=100 * eps)
     assert (found.lengths > 0).all()
+
+
+def test_where_a_folded_cell_leads_back():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the fold
+        mesh = testing.nasty_meshes("float64", ["folded"])["folded"]
+    assert mesh.report.folded
+    rays = testing.nasty_rays(mesh, count=12)["through a centroid"]
+    found = jaxvr.probe(mesh, rays, testing.nasty_transfers()["two points"])
+    back = found.distances[:, 1] < found.distances[:, 0]
+    assert back.any() and not back.all() and (found.lengths > 0).all()
+    shares = inside(mesh, found)
+    assert shares.min() > -1e-10
+    values = np.asarray(mesh.values)[np.asarray(mesh.cells)[found.cells]]
+    np.testing.assert_allclose(
+        np.einsum("sek,sk->se", shares, values), found.scalars, rtol=0, atol=1e-10
+    )
 
 
 def test_pixels_and_rays_are_parts_of_the_whole():

@@ -146,9 +146,10 @@ class AbstractTracer(abc.ABC):
         if there is none, which these refuse."""
         return None
 
-    def locate(self, scene: Any, rays: Any, state: Any) -> tuple[Array, Array]:
-        """Of the current segments: the cell (R,) int32 that each lies in, and the distance (R,)
-        from the ray's origin to its back. Of rays without a segment: anything.
+    def locate(self, scene: Any, rays: Any, state: Any) -> tuple[Array, Array, Array]:
+        """Of the current segments: the cell (R,) int32 that each lies in, and the distances (R,)
+        from the ray's origin to its front and its back, not cut at the ends of the ray: they
+        descend where a folded cell leads back. Of rays without a segment: anything.
 
         Raises:
           ValueError: if the tracer does not know.

@@ -263,12 +263,17 @@ class KBuffer(AbstractTracer):
             entry = _entry(scene, rays, new, self)
             return _give(rays, _arrive(rays, state, new.hit, entry, self), go, done, self)
 
-    def locate(self, scene: CellFaces, rays: BeamRays, state: BufferState) -> tuple[Array, Array]:
-        enter, leave = (
-            jnp.where(state.active, word, 0) for word in (state.faces.enter, state.faces.leave)
-        )
-        at = crossing_of_face(scene.scene, rays.sheared, leave, jnp.any(state.active))
-        return packing.cell_of(enter), (at.z + at.z_low) * rays.sheared.stretch
+    def locate(self, scene: CellFaces, rays: BeamRays, state: BufferState):
+        faces, wanted = state.faces, jnp.any(state.active)
+        first = jnp.where(faces.cut, faces.start, faces.enter)
+        distances = []
+        for word in (first, faces.leave):
+            word = jnp.where(state.active, word, 0)
+            at = crossing_of_face(scene.scene, rays.sheared, word, wanted)
+            distances.append((at.z + at.z_low) * rays.sheared.stretch)
+        if self.reverse:
+            distances.reverse()
+        return packing.cell_of(jnp.where(state.active, faces.enter, 0)), *distances
 
     def gradient_start(self, scene, rays, perturbed):
         by_rays = any(jax.tree.leaves(perturbed[1]))

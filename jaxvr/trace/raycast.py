@@ -93,7 +93,7 @@ class Cell(NamedTuple):
     word (R,): packed cell and local index of the apex. positive (R,): sign of the entry face.
     face: its three vertices (4, R). weights (3, R): their barycentric weights. exit_corner (R,):
     local index of the vertex that the exit face does not have. lead, reached: as they were ahead.
-    side: where the depth reached ahead lay.
+    side: where the depth reached ahead lay; depth (R,): that depth.
     """
 
     word: Array
@@ -104,6 +104,7 @@ class Cell(NamedTuple):
     lead: Array
     reached: Array
     side: Side
+    depth: Array
 
 
 class Ahead(NamedTuple):
@@ -184,7 +185,7 @@ class RayCast(AbstractTracer):
         face, ones = (vertex, vertex, vertex), jnp.ones((3, count), dtype)
         none = Side(no, None if rays.far is None else no)
         return CastState(
-            cell=Cell(integer, no, face, ones, integer, zero, integer, none),
+            cell=Cell(integer, no, face, ones, integer, zero, integer, none, zero),
             ahead=Ahead(
                 *(integer, no, face, ones, jnp.zeros((2, count), dtype), zero, zero, integer)
             ),
@@ -216,10 +217,12 @@ class RayCast(AbstractTracer):
             )
             return _cross(scene.mesh, rays, state, moved, enter)
 
-    def locate(self, scene: CastScene, rays: ShearedRays, state: CastState) -> tuple[Array, Array]:
-        depth = state.ahead.depth[0] + state.ahead.depth[1]
-        distance = depth * rays.stretch
-        return packing.cell_of(state.cell.word), -distance if self.reverse else distance
+    def locate(self, scene: CastScene, rays: ShearedRays, state: CastState):
+        back = (state.ahead.depth[0] + state.ahead.depth[1]) * rays.stretch
+        front = state.cell.depth * rays.stretch
+        if self.reverse:
+            front, back = -front, -back
+        return packing.cell_of(state.cell.word), front, back
 
     def gradient_start(self, scene, rays, perturbed):
         by_rays = any(jax.tree.leaves(perturbed[1]))
@@ -345,6 +348,7 @@ def _cross(
     cell = Cell(
         *(word, ahead.positive, face, ahead.weights, exit_corner),
         *(ahead.lead, ahead.reached, side_of(ahead.depth, rays.interval)),
+        ahead.depth[0] + ahead.depth[1],
     )
     active = jnp.where(moved, ~(lost | astray), state.active)
     segment = choose(moved, segment, state.segment)
