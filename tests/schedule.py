@@ -16,6 +16,8 @@ SLOWEST = (
     "test_experiments.py",
     "test_notebooks.py",
     "trace/test_flat_kbuffer.py",
+    "trace/test_interval.py",
+    "test_recipes.py",
     "test_docs.py",
     "test_state_machine.py",
     "composite/test_projections.py",
