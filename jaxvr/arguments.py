@@ -203,7 +203,7 @@ def tracer_of(tracer: Any, volume: Any) -> AbstractTracer:
     """A tracer for a volume, its default one if that is None. volume: checked; None if there is
     none, but segments that were traced."""
     if tracer is None:
-        return RayCast() if volume is None else volume.default_tracer()
+        return RayCast() if volume is None else registered("tracer", volume.default_tracer())
     found = _noun("tracer", tracer, "prepare_rays", RayCast)
     _require_methods("tracer", found, ("prepare", "start", "step", "longest"), AbstractTracer)
     takes = getattr(found, "takes", AbstractVolume)
@@ -306,7 +306,8 @@ def _noun(name: str, given: Any, method: str, usual: type, default: Any = None) 
     """What was given, or the default if that is None. It is known by a method: a user's own needs
     no base."""
     if given is None:
-        return (default or usual)()
+        found = (default or usual)()
+        return registered(name, found) if name in NOUNS else found
     if isinstance(given, type) and hasattr(given, method):
         raise ValueError(
             f"{name} is the class {given.__name__}, not one of its objects: did you forget the ()?"

@@ -400,8 +400,8 @@ class Half:
     def prepare(self, volume):
         return volume
 
-    def prepare_rays(self, scene, origins, directions):
-        return origins, directions
+    def prepare_rays(self, scene, rays):
+        return rays
 
 
 def march() -> Any:
@@ -484,8 +484,8 @@ class OneWay(AbstractTracer):
     def prepare(self, volume):
         return march().prepare(volume)
 
-    def prepare_rays(self, scene, origins, directions):
-        return march().prepare_rays(scene, origins, directions)
+    def prepare_rays(self, scene, rays):
+        return march().prepare_rays(scene, rays)
 
     def start(self, scene, rays):
         return march().start(scene, rays)

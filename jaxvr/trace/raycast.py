@@ -160,7 +160,7 @@ class RayCast(AbstractTracer):
     takes: ClassVar[type] = TetMesh
     cuts: ClassVar[bool] = True
 
-    reverse: bool = static(default=False)
+    reverse: bool = static(default=False, repr=False)
 
     def reversed(self) -> RayCast:
         return RayCast(not self.reverse)

@@ -109,7 +109,7 @@ def shear_rays(rays: Rays, scale: Array) -> ShearedRays:
 
     norm = jnp.sqrt(jnp.sum((d / largest[:, None]) ** 2, -1)) * largest
     stretch = norm / jnp.abs(d_z) / scale
-    near, far = (None if x is None else x / stretch for x in (rays.near, rays.far))
+    near, far = (None if x is None else _depth(x, stretch) for x in (rays.near, rays.far))
     return ShearedRays(
         axis_x,
         axis_y,
@@ -127,6 +127,12 @@ def shear_rays(rays: Rays, scale: Array) -> ShearedRays:
         far,
         None if far is None else lax.stop_gradient(far),
     )
+
+
+def _depth(distance: Array, stretch: Array) -> Array:
+    """Where distances along rays lie. What is infinitely far does not move with the ray."""
+    known = jnp.isfinite(distance)
+    return jnp.where(known, jnp.where(known, distance, 0) / stretch, distance)
 
 
 def _accurate(a: Array, a_low: Array, z: Halves, z_low: Array, s: Array, s_low: Array) -> Array:

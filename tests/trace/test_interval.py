@@ -210,6 +210,27 @@ def test_no_ends_are_those_of_a_ray(how):
     assert not seen(near=0.0, far=0.0).any()
 
 
+def test_what_is_infinitely_far_does_not_move():
+    """Derivatives by rays, which scale the places of their ends."""
+    mesh, transfer = registry.mesh_of("point", "float64"), registry.transfer_of("float64")
+    origins, directions = (x.reshape(-1, 3) for x in registry.camera_of("float64").rays())
+
+    def slope(**more):
+        def total(directions):
+            return jaxvr.render_rays(mesh, origins, directions, transfer, **more).sum()
+
+        return jax.jit(jax.grad(total))(directions)
+
+    want = slope()
+    assert np.abs(want).max() > 0.1
+    for more in (*HOW.values(), *OTHERS.values()):
+        if more.get("adjoint") is not None:
+            continue
+        for ends in ({"near": 0.0, "far": np.inf}, {}):
+            assert np.allclose(slope(**ends, **more), want, rtol=1e-9, atol=1e-11)
+    assert not slope(near=np.inf, far=np.inf).any()
+
+
 def test_units_change_no_bit():
     mesh, origins, directions, places = nasty("seams", "float32")
     transfer = testing.nasty_transfers(dtype="float32")["two points"]
