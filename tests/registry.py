@@ -167,6 +167,8 @@ def combinations() -> Iterator[tuple[Entry, Entry, Entry, str]]:
 
 def states(mesh, rays, transfer, compositor, engine, near, far):
     """The compositor's state at the end of rays (origins, directions) (R, 3): leaves (..., R)."""
+    pipeline = Pipeline(jaxvr.RayCast(), compositor.default_integrator(), compositor)
+    assert engine.refuses(pipeline, mesh.dtype) is None
     origins, directions = rays
     given = rays_of(origins, directions, mesh, near, far)
     state, status = _states(engine, compositor, mesh, given, transfer)

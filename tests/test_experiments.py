@@ -100,7 +100,7 @@ def against_itself(folder: Path) -> float:
 
 
 def cut_and_merge_apart(folder: Path) -> float:
-    mesh = jaxvr.datasets.box((3, 3, 3), jitter=0.2, seed=1)
+    mesh = jaxvr.datasets.box((3, 3, 3), jitter=0.2, seed=1, dtype="float32")
     found = cut_and_merge.run(mesh, 64)
     return max(x for by_engine in found.values() for x in by_engine.values())
 

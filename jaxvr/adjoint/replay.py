@@ -155,7 +155,7 @@ def _asked(pipeline: Pipeline, operands: Operands, perturbed: list[bool]) -> Ask
     if any(tracer) and _uses(moves, pipeline.tracer, tracer):
         refuse(pipeline.tracer, "start or step", "hand them on in the scene, by prepare")
     dtype = jax.tree.leaves(operands.table)[0].dtype
-    count = jax.tree.leaves(first)[0].shape[0]
+    count = jax.tree.leaves(first)[0].shape[-1]
     if any(compositor) and _uses(lambda c: c.init(count, dtype), pipeline.compositor, compositor):
         refuse(pipeline.compositor, "init", "use them in add or finish")
     optical = pipeline.compositor.shades and any(jax.tree.leaves(table))

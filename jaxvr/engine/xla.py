@@ -60,9 +60,9 @@ class XLA(AbstractEngine):
         return record(tracer, scene, rays)
 
     def fill(self, tracer, scene, rays, start, total):
-        shape = jax.tree.leaves(rays)[0].shape
-        start = jnp.pad(start, (0, shape[0] * shape[1] - start.shape[0]), mode="edge")
-        return fill(tracer, scene, rays, start.reshape(shape), total)
+        batches, *_, size = jax.tree.leaves(rays)[0].shape
+        start = jnp.pad(start, (0, batches * size - start.shape[0]), mode="edge")
+        return fill(tracer, scene, rays, start.reshape(batches, size), total)
 
 
 def _walk_again(
