@@ -202,16 +202,26 @@ def segments_of(segments: Any) -> Segments:
 def tracer_of(tracer: Any, volume: Any) -> AbstractTracer:
     """A tracer for a volume, its default one if that is None. volume: checked; None if there is
     none, but segments that were traced."""
-    if tracer is None:
-        return RayCast() if volume is None else registered("tracer", volume.default_tracer())
+    if tracer is None and volume is not None:
+        tracer = volume.default_tracer()
     found = _noun("tracer", tracer, "prepare_rays", RayCast)
     _require_methods("tracer", found, ("prepare", "start", "step", "longest"), AbstractTracer)
+    if getattr(found, "reverse", False):
+        raise ValueError(
+            f"tracer is a {type(found).__name__} with reverse=True, and which end comes first is "
+            'for the compositor to say: leave it out, and take Over(direction="back to front").'
+        )
     takes = getattr(found, "takes", AbstractVolume)
     if volume is not None and not isinstance(volume, takes):
         kind = type(volume).__name__
+        default = volume.default_tracer()
+        instead = (
+            f"which its default_tracer() gives: it must give one for a {kind}."
+            if type(default) is type(found)
+            else f"leave tracer out, which takes {default!r}."
+        )
         raise ValueError(
-            f"{type(found).__name__} traces a {takes.__name__}, and volume is a {kind}: leave "
-            f"tracer out, which takes {volume.default_tracer()!r}."
+            f"{type(found).__name__} traces a {takes.__name__}, and volume is a {kind}: {instead}"
         )
     return found
 

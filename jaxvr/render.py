@@ -283,7 +283,9 @@ def render_rays(
       near, far: world distances from the origins, numbers or (...,): of each ray what lies between
         them is seen, cut there inside of cells too. None for 0 and for no end. What is before the
         origin is never seen, so that a `near` below 0 is 0; nothing is where `far` is below `near`.
-        A ray stops at `far`, which saves time unless the mesh has folded cells.
+        A ray stops at `far`, which saves time unless the mesh has folded cells. Places are as exact
+        as numbers of the dtype are at that distance. What lies on both sides of a cut merges by the
+        over operator to the whole; where cells are folded only sums do, as alpha.
       status: also return the status bits (...,) int32 of each ray, for `jaxvr.check`.
       The rest as for `render`.
 

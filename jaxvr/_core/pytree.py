@@ -156,5 +156,7 @@ def refusing_derivatives(given: T) -> T:
     if not dataclasses.is_dataclass(given):
         return given
     words = {f.name: f.metadata["held"] for f in dataclasses.fields(given) if "held" in f.metadata}
-    parts = {k: constant(getattr(given, k), text) for k, text in words.items()}
+    # A class that is not registered is static, and its numbers are no arrays.
+    held = {k: x for k in words if hasattr(x := getattr(given, k), "dtype")}
+    parts = {k: constant(x, words[k]) for k, x in held.items()}
     return dataclasses.replace(given, **parts) if parts else given  # type: ignore[type-var]

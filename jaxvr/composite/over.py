@@ -152,7 +152,12 @@ class Over(AbstractCompositor):
 
     def finish(self, state, transfer, scale):
         alpha = opacity(compensated.value(state.depth))
-        return jnp.concatenate([compensated.value(state.rgb), alpha[None]])
+        rgba = jnp.concatenate([compensated.value(state.rgb), alpha[None]])
+        if self.termination is None:
+            return rgba
+        # A number that was traced, or put in place by JAX, passed no constructor.
+        good = (self.termination >= 0) & (self.termination < 1)
+        return jnp.where(good, rgba, jnp.nan)
 
     def merge(self, front, back):
         through = compensated.exp_minus(front.depth)[None]

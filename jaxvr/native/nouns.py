@@ -114,5 +114,5 @@ def unwritten(tracer: Any, integrator: Any, compositor: Any) -> str | None:
     others = [noun for noun in nouns if type(noun) not in known]
     backwards = compositor is not None and compositor.backwards
     if backwards or (type(tracer) in TRACERS and TRACERS[type(tracer)].reverse(tracer)):
-        return "They go front to back."
+        return "Its loops go front to back."
     return f"There are none for {type(others[0]).__name__}." if others else None

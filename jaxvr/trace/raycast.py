@@ -206,7 +206,7 @@ class RayCast(AbstractTracer):
             inside = move & (state.ahead.word >= 0) & ~through
             gone = move & ~inside
             # A ray that waits for nothing is done.
-            left = ((state.entries.face[0] >= 0) | state.entries.more) & ~through
+            left = (state.entries.face[0] >= 0) | state.entries.more
             active, waiting = state.active & ~gone, state.waiting | (gone & left)
             # Entering is rare and costly, so it waits until no ray of the batch is inside.
             enter = ~jnp.any(active)
@@ -250,7 +250,7 @@ def stopping(scene: Scene, rays: ShearedRays) -> ShearedRays:
 
 
 def _is_through(rays: ShearedRays, ahead: Ahead) -> Array:
-    """Rays (R,) that have come farther than where anything is seen."""
+    """Rays (R,) that have come farther on their path than where anything is seen."""
     if rays.stop is None:
         return jnp.zeros_like(ahead.positive)
     return lax.stop_gradient(ahead.depth[0] + ahead.depth[1]) > rays.stop
@@ -275,6 +275,8 @@ def _enter(door: _Door, scene: CastScene, rays: ShearedRays) -> _Door:
     )
     word = entries.face[0]
     entering = door.waiting & (word >= 0)
+    if rays.stop is not None:  # another path may begin before it, where a mesh overlaps itself
+        entering = entering & ~(entries.depth[0] > rays.stop)
     last = (
         jnp.where(entering, entries.depth[0], door.last[0]),
         jnp.where(entering, word, door.last[1]),

@@ -82,7 +82,7 @@ def test_what_cannot_be_had_from_behind_is_said():
         jaxvr.shade(segments, transfer, compositor=BEHIND, engine=engine)
     for tracer, compositor in ((Recorded(), BEHIND), (Recorded(reverse=True), Over())):
         pipeline = Pipeline(tracer, jaxvr.Analytic(), compositor)
-        assert jaxvr.engine.C().refuses(pipeline, "float64") == "They go front to back."
+        assert jaxvr.engine.C().refuses(pipeline, "float64") == "Its loops go front to back."
 
 
 @pytest.mark.parametrize(
@@ -96,3 +96,28 @@ def test_a_slab_from_behind_is_the_slab_with_its_ends_exchanged(integrator):
     want = integrator.slab(*extinctions[::-1], *colors[::-1], length)
     for x, y in zip(got, want, strict=True):
         assert np.allclose(x, y, rtol=1e-13, atol=1e-16)
+
+
+def test_which_end_comes_first_is_for_the_compositor_to_say():
+    mesh, camera = registry.mesh_of("point", "float64"), registry.camera_of("float64")
+    transfer = registry.transfer_of("float64")
+    for tracer in (jaxvr.RayCast(reverse=True), jaxvr.KBuffer(reverse=True)):
+        with pytest.raises(ValueError, match="reverse=True, and which end comes first"):
+            jaxvr.render(mesh, camera, transfer, tracer=tracer)
+        with pytest.raises(ValueError, match="reverse=True, and which end comes first"):
+            jaxvr.trace(mesh, camera, tracer=tracer)
+        with pytest.raises(ValueError, match="reverse=True, and which end comes first"):
+            jaxvr.probe(mesh, camera, transfer, tracer=tracer)
+
+
+def test_a_termination_that_no_constructor_saw():
+    mesh, camera = registry.mesh_of("point", "float64"), registry.camera_of("float64")
+    transfer = registry.transfer_of("float64")
+
+    @jax.jit
+    def image(t):
+        return jaxvr.render(mesh, camera, transfer, compositor=Over(termination=t))
+
+    assert np.isfinite(image(0.5)).all()
+    for t in (2.0, -1.0, np.nan):
+        assert np.isnan(image(t)).all()

@@ -210,6 +210,38 @@ def test_no_ends_are_those_of_a_ray(how):
     assert not seen(near=0.0, far=0.0).any()
 
 
+def test_paths_that_overlap_are_all_cut():
+    """A cell within another that it has no point in common with: its path begins and ends while
+    the other's goes on. From behind, the eye is the end."""
+    size, place = np.array([[4.0], [0.5]]), np.array([[0, 0, 0], [0, 0, -0.3]])
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 2
+    points = (size[:, :, None] * corners + place[:, None]).reshape(-1, 3)
+    mesh = jaxvr.TetMesh.from_cells(
+        points,
+        {"tetra": np.arange(8).reshape(2, 4)[:, [0, 2, 1, 3]]},
+        np.repeat([1.0, 3.0], 4),
+        dtype="float64",
+    )
+    transfer = jaxvr.TransferFunction([0.0, 4.0], np.eye(2, 3), [0.1, 2.0], dtype="float64")
+    rays = np.array([0.05, 0.03, -5.0]), np.array([0.0, 0.0, 1.0])
+    pieces = BruteForce(mesh).pieces(rays[0][None], rays[1][None])
+    assert len(pieces.ray) == 2
+    inner = np.argmin(pieces.leave - pieces.enter)
+    begin, end = float(pieces.enter[inner]), float(pieces.leave[inner])
+    for far in (begin - 0.01, (begin + end) / 2, end + 0.01):
+        want = np.minimum(pieces.leave, far) - np.minimum(pieces.enter, far)
+        want = float((want * [1.0 if k != inner else 3.0 for k in (0, 1)]).sum())
+        for how in HOW.values():
+            got = jaxvr.render_rays(mesh, *rays, None, far=far, compositor=jaxvr.XRay(), **how)
+            assert abs(got[0] - want) < 1e-12
+    eye = rays[0] + (begin + end) / 2 * rays[1]
+    want, got = (
+        jaxvr.render_rays(mesh, eye, rays[1], transfer, compositor=c)
+        for c in (jaxvr.Over(), BEHIND)
+    )
+    assert abs(got[3] - want[3]) < 1e-14 and 0.1 < got[3] < 0.9
+
+
 def test_what_is_infinitely_far_does_not_move():
     """Derivatives by rays, which scale the places of their ends."""
     mesh, transfer = registry.mesh_of("point", "float64"), registry.transfer_of("float64")

@@ -352,14 +352,18 @@ static inline int goes_on(const World *world, Block *block) {
   return block->n && !is_over(watch);
 }
 
-/* Whether a lane needs nothing more: its optical depth has reached `enough`, or it is through. */
-static inline word_t is_done(const Lanes *lanes, int i, real enough) {
-  word_t opaque = MASK(lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough);
-  return opaque | MASK(lanes->row[DEPTH][i] + lanes->row[DEPTH + 1][i] > lanes->row[STOP][i]);
+/* Whether a lane needs nothing more: its optical depth has reached `enough`. */
+static inline word_t is_opaque(const Lanes *lanes, int i, real enough) {
+  return MASK(lanes->row[SUMS][i] - lanes->row[SUMS + 4][i] >= enough);
 }
 
-/* Lanes that left the mesh enter again, or are handed to `done` and make room; so do those that are
- * done. */
+/* Whether a lane has come farther on its path than where anything is seen. */
+static inline word_t is_through(const Lanes *lanes, int i) {
+  return MASK(lanes->row[DEPTH][i] + lanes->row[DEPTH + 1][i] > lanes->row[STOP][i]);
+}
+
+/* Lanes that left the mesh, or are through, enter again, or are handed to `done` and make room; so
+ * do those that are opaque. */
 static void settle(const World *world, Block *block, int rows, real enough,
                    void (*done)(void *, Lanes *, int), void *data) {
   Lanes *lanes = &block->lanes;
@@ -369,12 +373,12 @@ static void settle(const World *world, Block *block, int rows, real enough,
   for (int i = 0; i < block->n; i++) {
     /* A cell that is not there, and the outside: both are no cell. */
     word_t out = MASK((uint32_t)(lanes->integer[NEXT][i] >> 4) >= cells);
-    any |= out | is_done(lanes, i, enough);
+    any |= out | is_opaque(lanes, i, enough) | is_through(lanes, i);
   }
   for (int i = block->n - 1; any && i >= 0; i--) {
-    int ended = is_done(lanes, i, enough) != 0;
+    int ended = is_opaque(lanes, i, enough) != 0;
     int next = lanes->integer[NEXT][i] >> 4;
-    if ((uint32_t)next < cells && !ended) continue;
+    if ((uint32_t)next < cells && !ended && !is_through(lanes, i)) continue;
     if (next != -1 && (uint32_t)next >= cells) is_broken(world->mesh.watch);
     if (!ended && !lanes->integer[LOST][i] && enter(world, block, i)) continue;
     done(data, lanes, i);
