@@ -388,7 +388,9 @@ def between(origins: Array, directions: Array, near: Any, far: Any) -> Rays:
 
 
 def _distance(name: str, x: Any, shape: tuple[int, ...], dtype: Any) -> Array:
-    x = as_floats(name, x)
+    given, x = x, as_floats(name, x)
+    if np.dtype(getattr(given, "dtype", None) or np.asarray(given).dtype).kind == "b":
+        raise ValueError(f"{name} must be None or hold distances, but holds booleans.")
     if is_concrete(x) and np.isnan(np.asarray(x)).any():
         raise ValueError(f"{name} is NaN for {int(np.isnan(np.asarray(x)).sum())} ray(s).")
     try:

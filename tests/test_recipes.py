@@ -420,6 +420,14 @@ def test_volumes_that_lack_something():
     with pytest.raises(TypeError, match="abstract.*Boundless.*bounds"):
         Boundless(grid.values)  # type: ignore[abstract]
     refused(Unnamed(grid.values), "Unnamed.lengths must name the fields")
+    named = Misnamed(grid.values)
+    for names, match in (
+        ("values", r"Misnamed.lengths must be a tuple of names, \('values',\), but is a string"),
+        (("spacing",), "Misnamed.lengths names 'spacing', which Misnamed has not"),
+        (("values",), "must name a field once, but name 'values' 2 times"),
+    ):
+        Misnamed.lengths = names  # type: ignore[assignment]
+        refused(named, match)
     refused(grid.replace(spacing=0.25), "Samples.spacing is float, but .* must be arrays")
     refused(grid.replace(spacing=grid.spacing.astype("float64")), "Samples.spacing is float64")
     refused(grid.replace(values=grid.values.astype("int32")), "must be arrays of one dtype")
@@ -458,6 +466,12 @@ class Boundless(AbstractVolume):
 class Unnamed(Boundless):
     def bounds(self):
         return np.zeros(3), np.ones(3)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Misnamed(Unnamed):
+    scalars = ("values",)
 
 
 @jax.tree_util.register_dataclass

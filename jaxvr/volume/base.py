@@ -78,12 +78,7 @@ class AbstractVolume(abc.ABC):
         """ValueError for what no picture can be made of, with the field's name. Of numbers that are
         traced only the dtype is looked at."""
         kind = type(self).__name__
-        for what in ("lengths", "scalars"):
-            if not getattr(self, what):
-                raise ValueError(
-                    f"{kind}.{what} must name the fields of {kind} that are {what}, but is empty: "
-                    "see jaxvr.volume.AbstractVolume."
-                )
+        self._require_names()
         for name in (*self.lengths, *self.scalars):
             x = getattr(self, name)
             found = getattr(x, "dtype", type(x).__name__)
@@ -95,6 +90,32 @@ class AbstractVolume(abc.ABC):
             if is_concrete(x) and not found_right((x,)):
                 require_finite(f"{kind}.{name}", x)
                 remember((x,))
+
+    def _require_names(self) -> None:
+        """What is named twice would be scaled twice, and a string is a list of its letters."""
+        kind = type(self).__name__
+        see = "see jaxvr.volume.AbstractVolume."
+        for what in ("lengths", "scalars"):
+            names = getattr(self, what)
+            if not names:
+                raise ValueError(
+                    f"{kind}.{what} must name the fields of {kind} that are {what}, but is empty: "
+                    f"{see}"
+                )
+            if isinstance(names, str):
+                raise ValueError(
+                    f"{kind}.{what} must be a tuple of names, ({names!r},), but is a string: {see}"
+                )
+            for name in names:
+                if not hasattr(self, name):
+                    raise ValueError(f"{kind}.{what} names {name!r}, which {kind} has not: {see}")
+        every = (*self.lengths, *self.scalars)
+        for name in every:
+            if every.count(name) > 1:
+                raise ValueError(
+                    f"{kind}.lengths and {kind}.scalars must name a field once, but name {name!r} "
+                    f"{every.count(name)} times: {see}"
+                )
 
     def hold(self, bits: Array) -> Array:
         """Status bits of any shape, with BROKEN where what `require` would refuse is traced."""

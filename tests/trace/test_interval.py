@@ -319,5 +319,9 @@ def test_mistakes():
         jaxvr.render_rays(mesh, *rays, transfer, far=far)
     with pytest.raises(ValueError, match=r"near must be a number or have the shape \(5, 6\)"):
         jaxvr.render_rays(mesh, *rays, transfer, near=np.zeros(3))
+    truths: Any = (True, [[True] * 6] * 5, jax.numpy.ones((5, 6), bool))
+    for near in truths:
+        with pytest.raises(ValueError, match="near must be None or hold distances"):
+            jaxvr.render_rays(mesh, *rays, transfer, near=near)
     got = jax.jit(lambda far: jaxvr.render_rays(mesh, *rays, transfer, far=far))(far)
     assert np.isnan(got[2, 3]).all() and np.isfinite(np.delete(got.reshape(-1, 4), 15, 0)).all()
