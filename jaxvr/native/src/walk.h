@@ -131,16 +131,18 @@ static void reload_values(const Mesh *mesh, Lanes *lanes, int n) {
   }
 }
 
-/* What lies behind the eye is cut off: returns the length in units of depth. */
+/* What lies behind the eye is cut off: returns the length in units of depth. Conditions are masks:
+ * of `sides` and truth values GCC 12 makes selections between truth values, and then it does not
+ * vectorise the loop round them. */
 INLINE real clip_at_eye(real z0, real z1, real chord, real *front, real *back, int32_t *sides) {
-  int behind0 = z0 < 0, behind1 = z1 < 0, cuts = behind0 != behind1;
-  real whole = cuts ? z1 - z0 : 1;
+  word_t behind0 = MASK(z0 < 0), behind1 = MASK(z1 < 0), cuts = behind0 ^ behind1;
+  real whole = PICK(cuts, z1 - z0, 1);
   real at_eye = *front + (*back - *front) * (-z0 / whole);
-  *front = cuts & behind0 ? at_eye : *front;
-  *back = cuts & behind1 ? at_eye : *back;
-  *sides = behind0 | (behind1 << 1);
-  real kept = behind0 ? 0 : chord;
-  return cuts ? most(z0, z1) : kept;
+  *front = PICK(cuts & behind0, at_eye, *front);
+  *back = PICK(cuts & behind1, at_eye, *back);
+  *sides = (int32_t)((behind0 & 1) | (behind1 & 2));
+  real kept = PICK(behind0, 0, chord);
+  return PICK(cuts, most(z0, z1), kept);
 }
 
 /* Where a segment from z0 to z1 with ends on these sides is cut: whether at its front and at its
